@@ -26,7 +26,7 @@ ERROR_NAMES = {"nominal": "as given", "before": "refitted", "after": "corrected"
 MOST_PRINTED = 8  # parameters and blind spots that are printed at most
 GRAVEST_SPOTS = 2  # blind spots that are printed right after the verdict
 NEAR_CONSTANT = 0.9  # error above which a refitted simulator is hardly better than a constant
-HELPS_MOTION = "; as fitted it helps the motion: the sign of the output, or of the port's rate, may be reversed"
+HELPS_MOTION = "as fitted it helps the motion: the sign of the output, or of the port's rate, may be reversed"
 INTERRUPTED = "The search was interrupted: the answer rests on the fits made until then."
 OUT_OF_TIME = (
     "The time limit ended the search: the answer rests on the fits made until then. A longer one (time_limit, "
@@ -50,7 +50,7 @@ class NamelessLaw:
 
     name: str  # with its port, in words
     equation: str
-    doubt: str  # what speaks against it, to follow the equation; empty if nothing does
+    doubt: str  # what speaks against it; empty if nothing does
     values: Mapping[str, tuple[str, str]]  # of the free parameters, with their units
     alike: str  # the laws, with their ports, that explain the recordings about as well; empty if none does
 
@@ -359,7 +359,8 @@ class ResultText:
         """List the laws of a correction without a sure name, with their values."""
         lines = list[str]()
         for law in self.nameless_laws:
-            lines += [f"in the correction, without a sure name: {law.name}", f"  {law.equation}{law.doubt}"]
+            lines += [f"in the correction, without a sure name: {law.name}"]
+            lines += ["  " + "; ".join(filter(None, [law.equation, law.doubt]))]
             lines += [f"  {name} = {value} {unit}".rstrip() for name, (value, unit) in law.values.items()]
             lines += [f"  cannot be told apart from {law.alike}"] if law.alike else []
         return lines

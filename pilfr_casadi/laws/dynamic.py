@@ -209,7 +209,7 @@ class Resonance(Law):
     places: ClassVar[tuple[str, ...]] = ("series",)
     absent: ClassVar[tuple[str, ...]] = ("thermal",)  # heat has no inertia
     order, follows = 2, 1
-    starts = {"W": lambda at: np.geomspace(0.015, 1.2, 16) / at.dt, "D": ("", 0.05)}
+    starts = {"W": lambda at: np.geomspace(0.015, 1.2, 16) / at.dt, "D": ("", 0.05, 0.5)}
     ranges = {"W": lambda at: (8 / at.duration, 1.6 / at.dt), "D": ("", 1e-3, 1.0)}
 
     def force(self, z: Any, q: Any, p: Any) -> Any:
@@ -228,6 +228,7 @@ class Mode(Resonance):
     sentence = "an unmodelled mode that the signal excites"
     units = {"c_1": "w/z", "c_2": "w/z", "W": "rad/s", "D": ""}
     places = ("parallel", "series")
+    starts = {**Resonance.starts, "D": ("", 0.05)}  # a mode that damps more is doubtful
 
     def force(self, q: Any, p: Any) -> Any:  # type: ignore[override]
         return p.c_1 * q[0] + p.c_2 * q[1]

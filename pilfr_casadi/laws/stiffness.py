@@ -226,12 +226,15 @@ class LossyContactBelow(PiecewiseStiffnessBelow, LossyContact):
 
 
 class DampedContact(PiecewiseStiffness):
-    """A contact with spring and damper that never pulls, as of a rubber pad; its force has no jump where it begins."""
+    """A contact with spring and damper that never pulls, as of a rubber pad; its force has no jump where it begins.
+
+    It acts from z = g - T dz/dt on, which is a little before the point if the motion towards it is fast.
+    """
 
     form = "above, with damper"
     equation = "w = k_c max(z - g + T dz/dt, 0)"
     source = "Brogliato (2016), Nonsmooth Mechanics, ch. 2"
-    sentence = "a contact with a spring and a damper beyond a point, which never pulls"
+    sentence = "a contact with a spring and a damper at a point, which never pulls"
     sentences: ClassVar[Mapping[str, str]] = {}
     units = {"k_c": "w/z", "g": "z", "T": "s"}
     domains = ("mechanical",)

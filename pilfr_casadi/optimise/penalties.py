@@ -84,8 +84,8 @@ class Penalties:
 def state_precision(engine: Engine, drive: Array, p: Array, n_x: int, n_s: int) -> Array | None:
     """Compute the prior precision (n_state, n_state) of an initial state with memory, in units of the outputs.
 
-    The prior is `N(0, S)`; see `state_covariance`. It is weighed against errors of `STATE_NOISE` per sample. None as
-    there.
+    The prior is `N(0, S)`; see `state_covariance`. It is weighed against errors of `STATE_NOISE` per sample. None
+    where that is None.
     """
     covariance = state_covariance(engine, drive, p, n_x, n_s)
     return None if covariance is None else STATE_NOISE**2 * np.linalg.inv(covariance)

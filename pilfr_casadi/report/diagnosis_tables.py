@@ -209,9 +209,10 @@ def nameless_blocks(diagnosis: Diagnosis) -> list[Block]:
     """Describe the laws of a correction without a sure name: equations, values, and the laws that explain as much."""
     out = list[Block]()
     for law in diagnosis.nameless_laws:
-        out += [Text(f"{law.name[0].upper()}{law.name[1:]}{law.doubt}:"), Code(law.equation)]
+        out += [Text(f"{law.name[0].upper()}{law.name[1:]}:"), Code(law.equation)]
         rows = [[name, value, unit or "–"] for name, (value, unit) in law.values.items()]
         out += [Table(["parameter", "value", "unit"], rows)] if rows else []
+        out += [Text(f"{law.doubt[0].upper()}{law.doubt[1:]}.")] if law.doubt else []
         out += [Text(f"These recordings cannot tell it apart from {law.alike}.")] if law.alike else []
     return out
 
@@ -432,10 +433,10 @@ class Action:
 def measure_action(bench: Workbench, fitted: Fitted, effect: Effect, number: int | None) -> Action | None:
     """Measure the force of element `number` along the training recordings; None without one, or if its run diverges.
 
-    The equivalent damping takes the energy that the law takes (Jacobsen 1930), and the equivalent stiffness k minimises
-    the rms of w - k z; in a periodic motion both are those of Krylov & Bogoliubov (1943). A cycle is one upward
-    crossing of the mean of z. If z is a speed, only the damping is measured; a friction has no stiffness. Outside
-    mechanics, where force times motion is no energy, neither has a meaning.
+    The equivalent damping takes the energy that the law takes in whole cycles (Jacobsen 1930), and the equivalent
+    stiffness k minimises the rms of w - k z; in a periodic motion both are those of Krylov & Bogoliubov (1943). Cycles
+    begin where z crosses its mean upwards. If z is a speed, only the damping is measured; a friction has no stiffness.
+    Outside mechanics, where force times motion is no energy, neither has a meaning.
     """
     if number is None:
         return None
@@ -458,16 +459,32 @@ def measure_action(bench: Workbench, fitted: Fitted, effect: Effect, number: int
         rows += [["equivalent damping", float(damping), unit if port.unit and port.across_unit else ""]]
     elif mechanical:
         stiffness = (w - np.mean(w)) @ (z - np.mean(z)) / np.sum((z - np.mean(z)) ** 2)
-        taken = sum(float(trapezoid(f, x)) for x, _, f in runs)
-        damping = taken / max(sum(float(trapezoid(v, x)) for x, v, _ in runs), 1e-300)  # over the integral of v^2
-        cycles = sum(int(np.sum(np.diff(np.signbit(x - np.mean(x)).astype(int)) < 0)) for x, _, _ in runs)
+        opposes = effect.law.endswith(OPPOSING_MOTION)
+        closed, counts = zip(*(_whole_cycles(np.vstack(run)) for run in runs), strict=True)
+        cycles = sum(counts)
+        whole = runs if opposes and not cycles else closed  # what opposes motion stores no energy
+        taken = sum(float(trapezoid(f, x)) for x, _, f in whole)
+        over = sum(float(trapezoid(v, x)) for x, v, _ in whole)  # the integral of v^2
         units = [readable_unit(u, port.unit, port.across_unit) for u in ("w*z", "w/z")]
         known = bool(port.unit and port.across_unit)
         rows += [["energy taken per cycle, mean", taken / cycles, units[0] if known else ""]] if cycles else []
-        if not effect.law.endswith(OPPOSING_MOTION):
+        if not opposes:
             rows += [["equivalent stiffness", float(stiffness), units[1] if known else ""]]
-        rows += [["equivalent damping", float(damping), unit if known else ""]]
+        rows += [["equivalent damping", taken / over, unit if known else ""]] if over > 0 else []
     return Action(largest, Table(["how it acts in the training recordings", "value", "unit"], rows, digits=3))
+
+
+def _whole_cycles(run: np.ndarray) -> tuple[np.ndarray, int]:
+    """Return the part of a run (z, dz/dt, w) from the first to the last upward crossing of its mean, and its cycles.
+
+    There z is the same at both ends, so that a spring has given back what it had taken.
+    """
+    z = run[0] - np.mean(run[0])
+    up = np.flatnonzero(np.diff(np.signbit(z).astype(int)) < 0)
+    if len(up) < 2:
+        return run[:, :0], 0
+    ends = [run[:, [k]] + (run[:, [k + 1]] - run[:, [k]]) * z[k] / (z[k] - z[k + 1]) for k in (up[0], up[-1])]
+    return np.hstack([ends[0], run[:, up[0] + 1 : up[-1] + 1], ends[1]]), len(up) - 1
 
 
 def element_of(fitted: Fitted, effect: Effect) -> int | None:

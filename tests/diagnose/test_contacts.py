@@ -1,5 +1,7 @@
 """Contacts that lose energy, in front of which a simulator without the contact runs away."""
 
+from dataclasses import replace
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -7,7 +9,16 @@ from diagnosis_example import recorded, rig
 
 import pilfr_casadi as pilfr
 from pilfr_casadi.diagnose.fits.evidence import FORMULA_ERROR, formula_tolerance
-from pilfr_casadi.laws import CoulombFriction, DampedContact, HertzContact, Law, LossyContact, PiecewiseStiffness
+from pilfr_casadi.laws import (
+    AsymmetricCubicStiffness,
+    CoulombFriction,
+    CubicStiffness,
+    DampedContact,
+    HertzContact,
+    Law,
+    LossyContact,
+    PiecewiseStiffness,
+)
 
 DT = 0.01
 
@@ -85,7 +96,58 @@ def test_friction_beside_a_contact_shows_its_damper():
     search.memo = {key: trial for key, trial in search.memo.items() if key in (frozenset(), plain)}
     assert search.best.key == plain
     search.compare_effects()
-    assert search.best.key == {("ground", DampedContact), ("ground", CoulombFriction)}
+    key = frozenset({("ground", DampedContact), ("ground", CoulombFriction)})
+    assert search.best.key == key
+
+    found = search.memo[key]  # as a fit from other values that ended in a wrong minimum
+    search.memo[key] = replace(found, mean_square=2 * search.memo[plain].mean_square)
+    search.fit_finer_forms(search.memo[plain].with_added(("ground", PiecewiseStiffness)))
+    assert search.memo[key].mean_square == pytest.approx(found.mean_square, rel=0.05)
+
+
+def test_a_contact_that_never_pulls_takes_no_stiffness_away():
+    """A spring that softens beyond a point may be less stiff there; with a loss, that would give energy."""
+    train = recorded(rig().with_element("ground", PiecewiseStiffness().at({"k_c": -250.0, "g": 0.01})), 0, samples=500)
+    found = pilfr.diagnose(rig(430.0, 5.0), train, laws=(PiecewiseStiffness, LossyContact), workers=1)
+    search, plain = found.evidence.search, frozenset({("ground", PiecewiseStiffness)})
+    assert search.memo[plain].own["k_c"] < 0
+    search.memo = {key: search.memo[key] for key in (frozenset(), plain)}
+    search.fit_finer_forms(search.memo[plain])
+    assert search.memo[frozenset({("ground", LossyContact)})].own["k_c"] >= 0
+
+
+def test_a_softening_spring_may_have_finer_forms_where_a_contact_was_screened_first():
+    """A contact pushes back; that is no reason why the other laws of the position should."""
+    train = recorded(rig().with_element("ground", CubicStiffness().at({"k_3": -4e3})), 0, samples=500)
+    found = pilfr.diagnose(rig(430.0, 5.0), train, laws=(CubicStiffness, LossyContact), workers=1)
+    search, plain = found.evidence.search, frozenset({("ground", CubicStiffness)})
+    first = search.moves[0]
+    by_sense = tuple(sorted(first.scored, key=lambda s: -s.sense))
+    search.moves[0] = replace(first, scored=by_sense)
+    assert by_sense[0].sense == 1 and search.memo[plain].own["k_3"] < 0
+    search.fit_forms(search.memo[plain], [AsymmetricCubicStiffness])
+    assert search.memo[frozenset({("ground", AsymmetricCubicStiffness)})].own["k_3"] < 0
+
+
+def test_a_heat_path_that_sets_in_at_a_temperature_is_no_contact():
+    """Finer forms are of the port's physical domain as well."""
+    room = pilfr.Simulator(
+        lambda x, u, p: {"T": (u.heat - p.k * x.T) / 20},
+        lambda x: {"T": x.T},
+        states=("T",),
+        inputs=("heat",),
+        parameters={"k": pilfr.Parameter(0.6, unit="W/K", bounds=(0.05, 5))},
+        ports=pilfr.Port("wall", {"T": -0.05}, lambda x: x.T, unit="W", across_unit="K"),
+    )
+    rng = np.random.default_rng(0)
+    u = np.repeat(rng.uniform(-15, 30, 20), 25)[:, None]
+    r = pilfr.Recording(u, np.zeros((500, 1)), 1.0, ("heat",), ("T",), initial="zero", hold="zero")
+    y = room.with_element("wall", PiecewiseStiffness().at({"k_c": 1.5, "g": 10.0})).simulate(r)
+    train = r.with_(y=y + 0.02 * rng.standard_normal(y.shape))
+    found = pilfr.diagnose(room, train, laws=("piecewise_stiffness",), workers=1)
+    assert [(e.law, e.form) for e in found.effects] == [("piecewise_stiffness", "above")]
+    tried = {kind for key in found.evidence.search.memo for _, kind in key}
+    assert PiecewiseStiffness in tried and not {LossyContact, DampedContact} & tried
 
 
 def test_a_simulator_that_runs_away_excuses_no_error():

@@ -1,15 +1,20 @@
 """The element of a fitted simulator that an effect is, and how it acts."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from diagnosis_example import rig as spring_rig
 from diagnosis_rig import recordings, rig
 
+from pilfr_casadi import Recording
 from pilfr_casadi.diagnose import Effect, Workbench, law_signals
 from pilfr_casadi.diagnose.faults.offsets import Offset
-from pilfr_casadi.laws import CoulombFriction, CubicStiffness, LossyContact
-from pilfr_casadi.report.diagnosis_tables import element_of, measure_action
+from pilfr_casadi.diagnose.result_text import NamelessLaw
+from pilfr_casadi.laws import CoulombFriction, CubicStiffness, LinearStiffness, LossyContact, ViscousDamping
+from pilfr_casadi.report.diagnosis_tables import element_of, measure_action, nameless_blocks
+from pilfr_casadi.report.page import Text
 
 
 def test_an_effect_is_found_behind_an_offset():
@@ -48,6 +53,40 @@ def test_the_equivalent_damping_takes_the_energy_of_the_law():
     effect = Effect("ground-m1", law.id, 0.9, "", "", {}, ())
     rows = {row[0]: row[1] for row in measure_action(bench, fitted, effect, 0).table.rows}
     z, dz, w = law_signals(bench, fitted, 0, 0)
+    up = np.flatnonzero((z[:-1] < np.mean(z)) & (z[1:] >= np.mean(z)))
+    z, dz, w = (v[up[0] : up[-1] + 1] for v in (z, dz, w))  # whole cycles, but for parts of a sample
     energy = float(np.sum((w[1:] + w[:-1]) / 2 * np.diff(z)))
     assert energy > 0 and rows["equivalent stiffness"] > 0
-    assert rows["equivalent damping"] == pytest.approx(energy / np.sum((dz[1:] + dz[:-1]) / 2 * np.diff(z)))
+    square = np.sum((dz[1:] + dz[:-1]) / 2 * np.diff(z))
+    assert rows["equivalent damping"] == pytest.approx(energy / square, rel=0.02)
+    assert rows["energy taken per cycle, mean"] == pytest.approx(energy / (len(up) - 1), rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("law", "d", "damping"),
+    [
+        (LinearStiffness({"k_1": 200.0}), 4.0, 0.0),
+        (LinearStiffness({"k_1": 200.0}), 30.0, None),
+        (ViscousDamping({"c_1": 3.0}), 4.0, 3.0),
+        (ViscousDamping({"c_1": 3.0}), 30.0, 3.0),
+    ],
+)
+def test_what_a_spring_stores_is_no_damping(law, d, damping):
+    """After a step the spring stays compressed; with much damping there is no whole cycle."""
+    simulator = spring_rig(400.0, d).with_element("ground", law)
+    u = np.where(np.arange(300) < 20, 0.0, 20.0)[:, None]
+    r = Recording(u, np.zeros((300, 1)), 0.01, ("force",), ("pos",), initial="zero", hold="zero")
+    bench = Workbench.of(simulator, [r.with_(y=simulator.simulate(r))], "zero")
+    fitted = bench.run(simulator, {}, [np.zeros(2)])
+    action = measure_action(bench, fitted, Effect("ground", law.id, 0.9, "", "", {}, ()), 0)
+    rows = {row[0]: row[1] for row in action.table.rows}
+    assert rows.get("equivalent damping") == (damping if damping is None else pytest.approx(damping, abs=1e-3))
+
+
+def test_what_speaks_against_a_law_without_a_sure_name_is_a_sentence():
+    law = NamelessLaw("dry friction at ground", "w = F_c sign(v)", "as fitted it helps the motion", {}, "")
+    blocks = nameless_blocks(SimpleNamespace(nameless_laws=[law]))
+    assert [b.text for b in blocks if isinstance(b, Text)] == [
+        "Dry friction at ground:",
+        "As fitted it helps the motion.",
+    ]

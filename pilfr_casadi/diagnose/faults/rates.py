@@ -24,6 +24,8 @@ from ..fits.workbench import Workbench
 from .gates import Gate
 from .timing import TimeShift, minimise
 
+ROUNDING = 1e-9  # share of a coordinate that is no motion
+
 
 def find_wrong_rates(bench: Workbench) -> list[Gate]:
     """Note each port whose recorded rate is late, or of another size, compared with its recorded coordinate."""
@@ -91,6 +93,8 @@ def _compare(runs: Sequence[Recording]) -> tuple[float, float]:
     from scipy.signal import detrend
 
     z, integral, rate = np.concatenate([detrend(r.y, axis=0) for r in runs]).T
+    if np.linalg.norm(z) < ROUNDING * np.linalg.norm(np.concatenate([r.y[:, 0] for r in runs])):  # only a drift
+        return 0.0, 1.0
     (g, c), *_ = np.linalg.lstsq(np.column_stack([integral, rate]), z)
     as_given, corrected = np.linalg.norm(z - integral), np.linalg.norm(z - g * integral - c * rate)
     if not (corrected < np.linalg.norm(z) / FAR_RATIO and as_given > FAR_RATIO * corrected and g):

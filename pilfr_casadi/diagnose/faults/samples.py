@@ -105,12 +105,13 @@ def find_glitches(y: np.ndarray, u: np.ndarray | None = None) -> tuple[np.ndarra
     Those at a pulse of one of the inputs u (M, n_u), or one sample later, may be the answer to it, and are left.
     """
     clean, found = np.array(y), np.zeros(0, dtype=int)
+    inputs = [(v, distances(v)) for v in ([] if u is None else u.T)]
     least = max(GLITCH_SIZE * float(np.std(y)), FEWEST_STEPS * sensor_step(y))
     while len(y) > 4 * NEIGHBOURHOOD * STENCIL and len(found) < EXCEPTION_SHARE * len(y):
         d = distances(clean)
         large = np.flatnonzero(np.abs(d) > least)
         alone = [k for k in large[_may_stand_alone(d, large)] if _stands_alone(clean, d, int(k))]
-        more = alone if u is None else [k for k in alone if not _answers(u, int(k))]
+        more = [k for k in alone if not any(_is_pulse(*v, int(k)) for v in inputs)]
         if not more:
             return np.sort(found), clean
         clean[more] -= d[more]
@@ -149,10 +150,10 @@ def _stands_alone(y: np.ndarray, d: np.ndarray, k: int) -> bool:
     return bool(np.max(np.abs(distances(other))) < ISOLATED_SHARE * abs(d[k]))
 
 
-def _answers(u: np.ndarray, k: int) -> bool:
+def _is_pulse(v: np.ndarray, d: np.ndarray, k: int) -> bool:
     """Tell whether an input has a pulse of one sample at sample k, or just before it."""
-    inner = range(max(k - 1, STENCIL), min(k + 1, len(u) - STENCIL))
-    return any(d[i] and _stands_alone(v, d, i) for v in u.T for d in [distances(v)] for i in inner)
+    inner = range(max(k - 1, STENCIL), min(k + 1, len(v) - STENCIL))
+    return any(d[i] and _stands_alone(v, d, i) for i in inner)
 
 
 # stale samples
@@ -252,17 +253,19 @@ def find_frozen_channels(recordings: Sequence[Recording]) -> list[Gate]:
             begin, end = stretches[k][0]
             jump = columns[k][end] - columns[k][begin]
             where = f" of recording {k + 1}" if len(recordings) > 1 else ""
+            unless = "it was held there" if side == "u" else "the machine stuck there"
+            remedy = "cut the recording" + ", or empty the repeated cells" * (side == "u")
             sentence = (
                 f"{name} repeats one value from t = {first.dt * begin:.6g} s to {first.dt * (end - 1):.6g} s{where}, "
                 f"and then jumps by {jump:.3g}, farther than in any other step, as if sensor or logger stood still. "
-                "Unless the machine stuck there, cut the recording, or empty the repeated cells of an input."
+                f"Unless {unless}, {remedy}."
             )
             found.append(Gate(name, "frozen", int(sum(np.sum(np.diff(s)) for s in stretches)), sentence, False))
     return found
 
 
 def _is_fine(columns: Sequence[np.ndarray]) -> bool:
-    """Tell whether most steps of a channel lead to another value, and most of its values are different."""
+    """Tell whether most samples of a channel have a value of their own."""
     together = np.concatenate(columns)
     return len(np.unique(together)) > DISTINCT_SHARE * len(together)
 

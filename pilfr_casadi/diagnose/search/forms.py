@@ -31,6 +31,7 @@ from ...laws import (
     varying,
 )
 from ...simulators import PARAMETER, Placed, in_series, kind_of
+from ..faults.gates import EQUAL_RATIO
 from ..fits.evidence import FAR_RATIO, NEAR_RATIO
 from ..fits.force_recovery import forces_of_change, signals_along
 from ..fits.linearise import port_signals
@@ -155,10 +156,16 @@ class Forms(Hypotheses):
         self.replace_variation(parent)
 
     def fit_finer_forms(self, trial: Trial) -> None:
-        """Fit a hypothesis with its added law in each form that extends it, if it was not fitted before."""
-        kind, others = type(trial.law), trial.key - {trial.pair}
-        finer = [*FINER.get(kind, ()), *(k for k in self.laws if k.extends(kind))]
-        self.fit_forms(trial, [k for k in finer if others | {(trial.port, k)} not in self.memo])
+        """Fit a hypothesis with its added law in each form that extends it.
+
+        A form that was fitted before is fitted again if it contains the law and follows worse.
+        """
+        kind, others, most = type(trial.law), trial.key - {trial.pair}, EQUAL_RATIO * trial.mean_square
+        port = self.bench.simulator.port(trial.port)
+        finer = [k for k in (*FINER.get(kind, ()), *(k for k in self.laws if k.extends(kind))) if port.admits(k)]
+        known = {k: self.memo.get(others | {(trial.port, k)}) for k in finer}
+        worse = [k for k, fit in known.items() if fit is None or (issubclass(k, kind) and fit.mean_square > most)]
+        self.fit_forms(trial, worse)
 
     def _vary_strength(self) -> None:
         """Let the strength of the likeliest law of the last move that may vary do so, with every signal.
@@ -192,6 +199,10 @@ class Forms(Hypotheses):
         there = [s for move in self.moves for s in move.scored if s.port == trial.port]
         return min(there, key=lambda s: s.law.dissipative != trial.law.dissipative, default=None)
 
+    def _sense(self, port: str, kind: type[Law]) -> int:
+        """Return the sign of a law's strengths with which it was screened at a port; 0 if it was not, or has none."""
+        return next((s.sense for move in self.moves for s in move.scored if s.pair == (port, kind)), 0)
+
     def fit_forms(self, trial: Trial, kinds: Sequence[Any]) -> None:
         """Fit a hypothesis with its added law in other forms, which start from its values and oppose motion alike.
 
@@ -208,7 +219,8 @@ class Forms(Hypotheses):
 
         def fit(kind: Any) -> Trial | None:
             starts = list(kind.finer_starts(trial.law.at(trial.own), entry.local))
-            placed = [place_law(bare, replace(entry, law=kind()), own, index) for own in starts]
+            sense = entry.sense if law.dissipative else self._sense(trial.port, constant(kind))
+            placed = [place_law(bare, replace(entry, law=kind(), sense=sense), own, index) for own in starts]
             values = [{**base.values, **named} for _, named in placed]
             found = self.fits.fit(placed[0][0], values, len(trial.laws), states=base.begin)
             return found and found.with_added((trial.port, kind))

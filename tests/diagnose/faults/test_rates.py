@@ -124,6 +124,12 @@ def test_a_right_rate_and_an_unrelated_one_are_not_noted() -> None:
     assert not sentences(SPINDLE, [[drifting, SPEED], [SPEED]])
 
 
+def test_a_steady_motion_without_noise_tells_nothing_of_its_rate() -> None:
+    u = np.column_stack([T, np.full(len(T), 57.3)])
+    r = pilfr.Recording(u, np.ones((len(T), 1)), DT, inputs=SPINDLE.inputs, outputs=SPINDLE.output_names)
+    assert not find_wrong_rates(Workbench.of(SPINDLE, [r], "zero", "auto"))
+
+
 def test_friction_that_helps_the_motion_points_to_a_reversed_sign() -> None:
     every = slice(None, None, 3)
     friction = 0.5 * np.tanh(SPEED / 0.005)

@@ -97,6 +97,9 @@ def test_a_channel_that_stands_still_while_the_machine_moves_is_noted(kind):
     found = find_frozen_channels([r])
     assert [g.channel for g in found] == {"frozen": ["y"], "both": ["u", "y"]}.get(kind, [])
     assert all(g.value == 40 and "from t = 30 s to 33.9 s" in g.sentence for g in found)
+    ends = {"u": "Unless it was held there, cut the recording, or empty the repeated cells."}
+    ends["y"] = "Unless the machine stuck there, cut the recording."
+    assert all(g.sentence.endswith(ends[g.channel]) for g in found)
 
 
 @pytest.mark.parametrize("late", [0, 1])

@@ -12,20 +12,22 @@ import pilfr_casadi as pilfr
 from pilfr_casadi import Parameter, Port, Recording, Simulator
 from pilfr_casadi.diagnose import Workbench, port_signals
 from pilfr_casadi.diagnose.fits.force_recovery import forces_of_change
-from pilfr_casadi.diagnose.fits.screen import Scored
+from pilfr_casadi.diagnose.fits.screen import Scored, screen
 from pilfr_casadi.diagnose.search.forms import in_place_of_variation
-from pilfr_casadi.diagnose.search.trials import Trial, Trials, select_pairs
+from pilfr_casadi.diagnose.search.trials import Effort, Trial, Trials, select_pairs
 from pilfr_casadi.laws import (
     Backlash,
     CoulombFriction,
     CubicDamping,
     CubicStiffness,
+    Delay,
     LinearStiffness,
     PeriodicForce,
     PowerDrag,
     ProgressiveStiffness,
     QuadraticDrag,
     QuadraticStiffness,
+    Resonance,
     StribeckFriction,
     scheduled,
     varying,
@@ -151,3 +153,14 @@ def test_a_fit_starts_from_the_best_values_of_both_runs(tiny):
     first = Trials(bench, 1)._fit_briefly(Trial.of(refit, 0), entries, None)
     periods = [2 * largest / float(start["a.L"]) for start, _ in first.starts_again(False)]
     assert any(n == pytest.approx(3.0) for n in periods[1:])
+
+
+def test_a_well_damped_resonance_is_screened_as_such():
+    """In place of a delay or a lag: it has no peak, and from a sharp one, fits do not come to it."""
+    on = bench("actuator:force", Resonance().at({"W": 18.0, "D": 0.5}))
+    refit = on.fit(cart())
+    scored, _ = screen(on, refit, (Resonance, Delay), np.full(1, 1e-3), 1)
+    found = [s for s in scored if s.port == "actuator:force" and isinstance(s.law, Resonance)]
+    assert found[0].starts[0]["D"] > 0.1
+    best = Trials(on, 1).fit_pairs(Trial.of(refit, 0), [found], Effort(None, 0.0, True), lambda *_: None)[0][0]
+    assert best.own["W"] == pytest.approx(18.0, rel=0.05) and best.own["D"] == pytest.approx(0.5, rel=0.1)
