@@ -101,7 +101,7 @@ def test_friction_beside_a_contact_shows_its_damper():
 
     found = search.memo[key]  # as a fit from other values that ended in a wrong minimum
     search.memo[key] = replace(found, mean_square=2 * search.memo[plain].mean_square)
-    search.fit_finer_forms(search.memo[plain].with_added(("ground", PiecewiseStiffness)))
+    search.fit_related_forms(search.memo[plain].with_added(("ground", PiecewiseStiffness)))
     assert search.memo[key].mean_square == pytest.approx(found.mean_square, rel=0.05)
 
 
@@ -112,7 +112,7 @@ def test_a_contact_that_never_pulls_takes_no_stiffness_away():
     search, plain = found.evidence.search, frozenset({("ground", PiecewiseStiffness)})
     assert search.memo[plain].own["k_c"] < 0
     search.memo = {key: search.memo[key] for key in (frozenset(), plain)}
-    search.fit_finer_forms(search.memo[plain])
+    search.fit_related_forms(search.memo[plain])
     assert search.memo[frozenset({("ground", LossyContact)})].own["k_c"] >= 0
 
 

@@ -143,10 +143,10 @@ class Forms(Hypotheses):
         return best.with_added(*added) if len(added) == 1 and parent.key < best.key else None
 
     def refine_added(self, parent: Trial) -> None:
-        """Fit the best law of a move in its finer forms; then schedule the strength of the best law that allows it."""
+        """Fit the best law of a move in related forms; then schedule the strength of the best law that allows it."""
         best = self._best_with_one_more(parent)
         if best is not None:
-            self.fit_finer_forms(best)
+            self.fit_related_forms(best)
         self._vary_strength()
         best = self._best_with_one_more(parent)
         by = (best.law.scheduled_by or best.law.scaled_by) if best is not None else ""
@@ -155,17 +155,18 @@ class Forms(Hypotheses):
             self.fit_forms(best, [scheduled(kind, by, p) for p in likely_profiles(kind) if p != best.law.profile])
         self.replace_variation(parent)
 
-    def fit_finer_forms(self, trial: Trial) -> None:
-        """Fit a hypothesis with its added law in each form that extends it.
+    def fit_related_forms(self, trial: Trial) -> None:
+        """Fit a hypothesis with its added law in each form that extends it, and as its base class, the plainer law.
 
-        A form that was fitted before is fitted again if it contains the law and follows worse.
+        A form that was fitted before is fitted again if that fit was in a wrong minimum: it contains the law and
+        follows worse, or it is the plainer law and far worse.
         """
         kind, others, most = type(trial.law), trial.key - {trial.pair}, EQUAL_RATIO * trial.mean_square
-        port = self.bench.simulator.port(trial.port)
-        finer = [k for k in (*FINER.get(kind, ()), *(k for k in self.laws if k.extends(kind))) if port.admits(k)]
-        known = {k: self.memo.get(others | {(trial.port, k)}) for k in finer}
-        worse = [k for k, fit in known.items() if fit is None or (issubclass(k, kind) and fit.mean_square > most)]
-        self.fit_forms(trial, worse)
+        port, base = self.bench.simulator.port(trial.port), kind.__base__
+        related = [*FINER.get(kind, ()), *(k for k in self.laws if k.extends(kind) or k is base)]
+        limits = {k: NEAR_RATIO**2 * most if k is base else most if issubclass(k, kind) else np.inf for k in related}
+        known = {k: self.memo.get(others | {(trial.port, k)}) for k in related if port.admits(k)}
+        self.fit_forms(trial, [k for k, fit in known.items() if fit is None or fit.mean_square > limits[k]])
 
     def _vary_strength(self) -> None:
         """Let the strength of the likeliest law of the last move that may vary do so, with every signal.

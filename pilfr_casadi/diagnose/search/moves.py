@@ -279,7 +279,7 @@ class Search(Forms):
             while (best := self.best).effects and not self.past_deadline:
                 for element in best.effects:
                     if self.may_go_on():
-                        self.fit_finer_forms(best.with_added(element.pair))
+                        self.fit_related_forms(best.with_added(element.pair))
                     if len(best.effects) == 1:
                         continue
                     self.leave_out(best, [element])
