@@ -86,3 +86,8 @@ def test_a_failure_shows_its_traceback_in_debug_mode(tmp_path, monkeypatch):
     monkeypatch.setattr(demo, "demo_recordings", lambda: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         main(["demo", "--out", str(tmp_path)])
+
+
+def test_the_demonstration_names_the_friction_of_its_rig(capsys, tmp_path):
+    assert demo.diagnose_rig(tmp_path, 1) == 0
+    assert "The simulator leaves out Coulomb friction at ground-m2.\n" in capsys.readouterr().out
