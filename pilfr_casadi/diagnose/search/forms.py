@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import numpy as np
 
@@ -162,7 +162,9 @@ class Forms(Hypotheses):
         follows worse, or it is the plainer law and far worse.
         """
         kind, others, most = type(trial.law), trial.key - {trial.pair}, EQUAL_RATIO * trial.mean_square
-        port, base = self.bench.simulator.port(trial.port), kind.__base__
+        port, base = self.bench.simulator.port(trial.port), cast(Any, kind.__base__)
+        if not (base in self.laws and base.units.items() <= kind.units.items() and base.shares_values()):
+            base = None  # its values are of another kind
         related = [*FINER.get(kind, ()), *(k for k in self.laws if k.extends(kind) or k is base)]
         limits = {k: NEAR_RATIO**2 * most if k is base else most if issubclass(k, kind) else np.inf for k in related}
         known = {k: self.memo.get(others | {(trial.port, k)}) for k in related if port.admits(k)}
