@@ -58,6 +58,7 @@ if TYPE_CHECKING:
         Saturation as Saturation,
         SkewSaturation as SkewSaturation,
         SoftSaturation as SoftSaturation,
+        SteepCurve as SteepCurve,
         chebyshev as chebyshev,
     )
     from .dynamic import (

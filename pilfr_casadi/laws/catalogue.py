@@ -13,6 +13,7 @@ FINER: dict[type[Law], tuple[Any, ...]] = {
     hysteresis.StopHysteresis: (hysteresis.SmoothHysteresis,),
     hysteresis.PlayHysteresis: (hysteresis.FinePlays,),
     hysteresis.GeneralizedHysteresis: (hysteresis.FineGeneralized,),
+    curves.FreeCurve: (curves.SteepCurve,),
 }
 
 # laws in the order in which they are tried: file by file, in the order of their definitions

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
-from typing import Any
+from typing import Any, ClassVar
 
 import casadi as ca
 import numpy as np
@@ -202,8 +202,8 @@ class FreeCurve(Law):
     source = "Plett (2015), Battery Management Systems, vol. 1, sec. 2.2; Press et al. (2007), sec. 5.8"
     sentence = "a memoryless curve of a shape that no formula has"
     units = {"c": "w", "z_m": "z", "z_h": "z"}
-    strength = ("c",)
-    constants = ("z_m", "z_h")
+    strength: ClassVar[tuple[str, ...]] = ("c",)
+    constants: ClassVar[tuple[str, ...]] = ("z_m", "z_h")
     domains = ("electrical", "fluid")
     special = True
     degrees = tuple(range(2, 10))  # an offset and a slope are parameters of the simulator; nine follow a narrow knee
@@ -224,6 +224,40 @@ class FreeCurve(Law):
 
     def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
         yield {"z_m": (local.low + local.high) / 2, "z_h": max((local.high - local.low) / 2, 1e-300)}
+
+
+class SteepCurve(FreeCurve):
+    """A free curve with an exponential at one end, such as the open-circuit voltage of a cell that runs empty."""
+
+    form = "free with a steep end"
+    equation = (
+        "w = sum_i c_i (T_i(x) - T_i(x_0)) + a (L(x) - L(x_0)),  L(x) = exp(-(1 + s x) / e),  i = 2..9, "
+        "x = (z - z_m) / z_h,  x_0 = -z_m / z_h; along its tangents outside -1 <= x <= 1"
+    )
+    source = "Chen & Rincon-Mora (2006), IEEE Trans. Energy Convers. 21(2)"
+    sentence = "a memoryless curve of a shape that no formula has, steep at one end"
+    units = {**FreeCurve.units, "a": "w", "e": "", "s": ""}
+    strength = (*FreeCurve.strength, "a")
+    constants = (*FreeCurve.constants, "s")  # -1 if the steep end is that of large z
+    starts = {"e": ("", 0.02, 0.1), "s": ("", 1.0, -1.0)}
+    ranges = {"e": ("", 0.001, 0.5)}
+
+    def force(self, z: Any, p: Any) -> Any:
+        def steep(x: Any) -> Any:
+            beyond = 1 + p.s * x
+            return ca.exp(-ca.fmax(beyond, 0.0) / p.e) - ca.fmin(beyond, 0.0) / p.e
+
+        at_z, at_zero = (steep((one - p.z_m) / p.z_h) for one in (z, 0.0))
+        return super().force(z, p) + p.a * (at_z - at_zero)
+
+    def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
+        for range_of_z in super().shapes(local):
+            yield from (shape | range_of_z for shape in Law.shapes(self, local))
+
+    @classmethod
+    def finer_starts(cls, found: Law, local: Local) -> Iterator[dict[str, Any]]:
+        """Start at either end of a free curve that was found."""
+        yield from ({**shape, **found.values, "a": 0.0} for shape in cls().shapes(local))
 
 
 def chebyshev(x: Any, degree: int) -> list[Any]:

@@ -271,7 +271,7 @@ def test_plays_of_one_threshold_in_place_of_the_signal_are_hardly_more_than_a_ba
     assert law.doubtful(wide) and bent.doubtful({**wide, "a_2": 0.0, "a_3": 0.0, "b_2": 0.0})
 
 
-@pytest.mark.parametrize("plain", [kind for kind in FINER if kind is not StopHysteresis])
+@pytest.mark.parametrize("plain", (laws.PlayHysteresis, GeneralizedHysteresis))
 def test_more_plays_begin_near_those_that_they_refine(plain):
     (finer,) = FINER[plain]
     few = plain().at({"w": np.array([-0.4, 0.3, 0.2, 0.1, 0.1, 0.05]), "r": np.linspace(0.0, 0.5, 6)})
@@ -465,6 +465,30 @@ def test_a_free_curve_goes_on_along_its_tangents():
     for end, side in ((-0.3, z < -0.3), (0.7, z > 0.7)):
         slope = (curve(end + 1e-6) - curve(end - 1e-6)) / 2e-6
         assert np.allclose(w[side], curve(end) - curve(0.0) + slope * (z[side] - end), rtol=1e-6, atol=1e-6)
+
+
+def test_a_steep_curve_is_a_free_one_with_an_exponential_at_either_end():
+    law, rng = laws.SteepCurve(), np.random.default_rng(0)
+    z = np.linspace(2.0, 4.0, 101)
+    local = Local(z=z, dz=np.ones(101), dt=0.1, lengths=(101,))
+    (middle,) = laws.FreeCurve().shapes(local)
+    found = laws.FreeCurve().at({"c": rng.standard_normal(8), **middle})
+    starts = list(law.finer_starts(found, local))
+    assert {start["s"] for start in starts} == {-1.0, 1.0}
+
+    def force(one, values, at):
+        return np.array([float(one.force(float(x), Named("p", values))) for x in at])
+
+    for start in starts:
+        assert np.allclose(force(law, start, z), force(found, found.values, z), rtol=0, atol=1e-12)
+    alone = {**starts[0], "c": np.zeros(8), "a": 2.0, "e": 0.1, "s": 1.0}
+    low, half = middle["z_m"] - middle["z_h"], middle["z_h"]
+    exponential = 2.0 * np.exp(-(z - low) / (0.1 * half))
+    inside = z > low
+    got = force(law, alone, z)
+    assert np.allclose((got - got[-1])[inside], (exponential - exponential[-1])[inside], rtol=0, atol=1e-9)
+    beyond = force(law, alone, [low - 0.2, low - 0.1, low])
+    assert np.diff(beyond) == pytest.approx([-2.0 / half] * 2)
 
 
 def test_a_free_curve_is_free_where_the_signal_was_alone():

@@ -1,9 +1,11 @@
 """Forms that contain a law, and the plainer law, are fitted from its values."""
 
+import numpy as np
 from diagnosis_example import recorded, rig
 
 import pilfr_casadi as pilfr
-from pilfr_casadi.laws import PreslidingFriction, PreslidingStribeckFriction
+from pilfr_casadi import Parameter, Port, Recording, Simulator
+from pilfr_casadi.laws import FreeCurve, PreslidingFriction, PreslidingStribeckFriction
 
 
 def test_the_plainer_law_starts_from_the_values_of_the_finer_one():
@@ -15,3 +17,31 @@ def test_the_plainer_law_starts_from_the_values_of_the_finer_one():
     search.laws = both
     search.compare_effects()
     assert search.best.key == {("ground", PreslidingFriction)}
+
+
+def test_a_voltage_that_falls_steeply_where_a_cell_runs_empty_is_followed():
+    """A polynomial of ninth degree follows it to 2 %; the open-circuit voltage is that of Chen & Rincon-Mora (2006)."""
+    simulator = Simulator(
+        lambda x, u, p: {"charge": u.current / 3000},
+        lambda x, u, p: {"voltage": p.E_0 + p.E_1 * x.charge + p.R * u.current},
+        states=("charge",),
+        inputs=("current",),
+        parameters={
+            "E_0": Parameter(3.5, unit="V", bounds=(2, 5)),
+            "E_1": Parameter(0.5, unit="V", bounds=(0, 2)),
+            "R": Parameter(0.2, unit="Ohm", bounds=(0, 1)),
+        },
+        ports=(Port("electrode", into={"voltage": 1.0}, across=lambda x: x.charge, unit="V", across_unit="1"),),
+    )
+    rng, dt, initial = np.random.default_rng(0), 60.0, np.array([0.0])
+    level = 0.05 + 0.45 * (1 + np.cos(np.arange(400) / 25)) + 0.02 * np.sin(np.arange(400) / 3)
+    level = np.maximum(level - level.min(), 0.0)
+    current = np.append(np.diff(level), 0.0) * 3000 / dt
+    initial[0] = level[0]
+    voltage = 3.685 + 0.2156 * level - 0.1178 * level**2 + 0.3201 * level**3 - 1.031 * np.exp(-35 * level)
+    voltage += 0.08 * current + 1e-3 * rng.standard_normal(400)
+    names = {"inputs": ("current",), "outputs": ("voltage",)}
+    train = Recording(current, voltage, dt, hold="zero", initial=initial, **names)
+    found = pilfr.diagnose(simulator, train, laws=(FreeCurve,), workers=1)
+    assert [(e.law, e.form) for e in found.effects] == [("static_curve", "free with a steep end")]
+    assert found.errors["train"]["after"] < 0.008 < 0.3 < found.errors["train"]["before"]
