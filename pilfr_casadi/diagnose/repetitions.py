@@ -31,10 +31,11 @@ from .arguments import Request
 from .faults.gates import LEAST_GAIN, USELESS_FIT, Checked, Gate, error_ratio, evidence_gain
 from .faults.offsets import Offset, WrongStart
 from .faults.timing import TimeShift
-from .fits.evidence import AS_GIVEN_RATIO
+from .fits.evidence import AS_GIVEN_RATIO, SURE
 from .fits.floor import Floor, measured_floor
 from .fits.workbench import RunsAway
-from .prediction import disturbance_note, forget_sooner, observer_keeps_up, prediction_note, predictor
+from .posterior import posterior
+from .prediction import agreement_note, disturbance_note, forget_sooner, observer_keeps_up, prediction_note, predictor
 from .preparation import CHECKS, Prepared, hold_note, prepare
 from .search.moves import Search
 
@@ -81,34 +82,44 @@ def search_in_predictions(
     """
     observed, memory = predictor(request.simulator, request.recordings, hold, request.engine)
     observed_request = _with_observer(request, observed, memory)
-    found = search(replace(observed_request, most_effects=min(1, observed_request.most_effects)))
-    other = _search_forgetting_sooner(request, found, memory, search)
-    if other is None and request.most_effects > 1 and not found.search.cut_short:
-        found.search.resume(request.most_effects)
-        other = _search_forgetting_sooner(request, found, memory, search)
-    return other or (observed_request, found, memory)
+    first = search(replace(observed_request, most_effects=min(1, observed_request.most_effects)))
+    found = observed_request, first, memory
+    answer, compared = _search_forgetting_sooner(request, found, search), first.search.best.names
+    if answer[1] is first and request.most_effects > 1 and not first.search.cut_short:
+        first.search.resume(request.most_effects)
+        if first.search.best.names != compared:
+            answer = _search_forgetting_sooner(request, found, search)
+    return answer
 
 
 def _search_forgetting_sooner(
-    request: Request, found: Attempt, memory: float, search: Callable[[Request], Attempt]
-) -> tuple[Request, Attempt, float] | None:
-    """Search with a shorter memory if the likeliest hypothesis predicts better with one; None if it does not.
+    request: Request, found: tuple[Request, Attempt, float], search: Callable[[Request], Attempt]
+) -> tuple[Request, Attempt, float]:
+    """Search with a shorter memory if the likeliest hypothesis predicts better with one; return what was found if not.
 
-    None too if that search was cut short before it found as much.
+    So too if that search was cut short before it found as much. Effects that only the longer memory shows well enough
+    to be sure stay if they are the likeliest with the shorter one as well: then they do not only imitate it.
     """
-    sooner = forget_sooner(found.search, request.simulator, memory)
+    observed_request, first, memory = found
+    sooner = forget_sooner(first.search, request.simulator, memory)
     if sooner is None:
-        return None
+        return found
     observed, shorter = sooner
     note = disturbance_note(request.simulator, shorter, memory)
-    observed_request = _with_observer(
+    sooner_request = _with_observer(
         replace(request, say=request.say.under("shorter memory: ")), observed, shorter, note
     )
-    other = _again(found, partial(search, observed_request))
+    other = _again(first, partial(search, sooner_request))
     if other is None:
-        return None
-    before2, after2 = found.compared_with(other)
-    return None if other.search.cut_short and before2 <= after2 else (observed_request, other, shorter)
+        return found
+    before2, after2 = first.compared_with(other)
+    if other.search.cut_short and before2 <= after2:
+        return found
+    longer, sure = posterior(first.search), posterior(other.search).sure > SURE
+    if longer.sure > SURE and not sure and other.search.best.names == longer.best.names:
+        note = agreement_note(request.simulator, shorter, memory)
+        return replace(observed_request, notes=(*observed_request.notes, note)), first, memory
+    return sooner_request, other, shorter
 
 
 def _with_observer(request: Request, observed: Simulator, memory: float, *more: Gate) -> Request:

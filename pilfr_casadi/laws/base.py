@@ -45,7 +45,9 @@ from ..models import Parameter
 
 ONSET_WIDTH = 0.05  # of a contact, as a share of its gap
 
-MIN_SIDE = 0.05  # share of the reach that a signal must visit on either side, to tell the sides apart
+# share of the reach that a signal must visit on either side, to tell the sides apart; and of half the range that it
+# must go back, so that its turning points show
+MIN_SIDE = 0.05
 
 PEOPLE = ("coulomb", "stribeck", "hertz")  # persons in the names of laws and forms
 PROPER_NAMES = {
@@ -133,6 +135,12 @@ class Local:
     def speed(self) -> float:
         """Largest |ż|, without the outermost 1 %."""
         return max(float(np.quantile(np.abs(self.dz), 0.99)), 1e-300)
+
+    @cached_property
+    def one_way(self) -> bool:
+        """Whether z hardly turns round, so that any force with a memory of turning points is a curve of z."""
+        steps = np.diff(self.z)
+        return bool(min(steps[steps > 0].sum(), -steps[steps < 0].sum()) <= MIN_SIDE * self.half)
 
     @property
     def duration(self) -> float:
@@ -356,6 +364,8 @@ class Law:
         """Say why the data carries no information on this law; empty if it does."""
         if self.sensed and not local.readers:
             return "no output reads the coordinate"
+        if self.turns and local.one_way:
+            return "the signal hardly turns round"
         if self.seen_by and (self.seen_by not in local.readers or len(local.readers) == 1):
             return f"{self.seen_by} does not read the coordinate, or does so alone"
         hidden = self.two_sided and min(-local.low, local.high) <= MIN_SIDE * local.reach

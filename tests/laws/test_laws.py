@@ -440,6 +440,15 @@ def test_a_rectifying_sensor_sees_no_signs():
     assert law.why_not(one) and not law.why_not(both)
 
 
+@pytest.mark.parametrize("law", [kind() for kind in EVERY if kind.turns])
+def test_a_memory_of_turning_points_is_not_tried_where_the_signal_does_not_turn(law):
+    rise, back = np.linspace(-1.0, 1.0, 200), np.linspace(1.0, 0.5, 50)
+    once = Local(z=rise, dz=np.ones(200), dt=0.1, lengths=(200,))
+    both = Local(z=np.r_[rise, back], dz=np.r_[np.ones(200), -np.ones(50)], dt=0.1, lengths=(250,))
+    again = Local(z=np.r_[rise, rise], dz=np.ones(400), dt=0.1, lengths=(200, 200))
+    assert "turn" in law.why_not(once) and not law.why_not(both) and not law.why_not(again)
+
+
 @pytest.mark.parametrize("domain", ["thermal", "fluid", "electrical"])
 def test_nothing_deflects_or_speeds_where_heat_fluid_or_current_flows(domain):
     mechanical = {"spring", "stiffness", "deflection", "damper", "damping", "speed", "contact"}
