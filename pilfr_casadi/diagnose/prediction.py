@@ -156,8 +156,8 @@ def agreement_note(simulator: Simulator, shorter: float, memory: float) -> Gate:
     """Note that a shorter memory shows the same laws, though not well enough to be sure."""
     sentence = (
         f"With an observer that forgets within {shorter:.3g} s in place of {memory:.3g} s the simulator follows "
-        "better: disturbances that nobody recorded move the machine, or physics that no law here follows. The effects named "
-        "here are the likeliest there, too, but it shows them too little to be sure."
+        "better: disturbances that nobody recorded move the machine, or physics that no law here follows. The effects "
+        "named here are the likeliest there, too, but it shows them too little to be sure."
     )
     return Gate(", ".join(simulator.output_names), "disturbance", memory, sentence, corrected=False)
 

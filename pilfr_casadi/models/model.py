@@ -393,7 +393,7 @@ def map_points(function: ca.Function, *arguments: np.ndarray) -> list[np.ndarray
     arguments : arrays, shapes (K, n) or (n,)
         One row for each point, or the same vector at every point.
     """
-    count = next(len(a) for a in arguments if np.ndim(a) == 2)
+    function, count = _dense(function), next(len(a) for a in arguments if np.ndim(a) == 2)
     arrays = [np.ascontiguousarray(np.broadcast_to(a, (count, np.shape(a)[-1])), dtype=float) for a in arguments]
     results = [np.empty((count, function.size2_out(i), function.size1_out(i))) for i in range(function.n_out())]
     whole = count - count % BLOCK
@@ -403,6 +403,15 @@ def map_points(function: ca.Function, *arguments: np.ndarray) -> list[np.ndarray
     for k in range(whole, count):  # for a large function a map of another length would take longer to make
         _call(function, [a[k] for a in arrays], [out[k] for out in results])
     return [out.transpose(0, 2, 1) for out in results]
+
+
+@functools.lru_cache(maxsize=256)
+def _dense(function: ca.Function) -> ca.Function:
+    """Give a function dense results: of a sparse one, a buffer gets the stored entries alone."""
+    if all(function.sparsity_out(i).is_dense() for i in range(function.n_out())):
+        return function
+    arguments = function.mx_in()
+    return ca.Function(function.name(), arguments, [ca.densify(found) for found in function.call(arguments)])
 
 
 @functools.lru_cache(maxsize=16)
@@ -425,7 +434,7 @@ def accumulate_steps(function: ca.Function, state: np.ndarray, *arguments: np.nd
     filled = (np.concatenate([a, np.repeat(a[-1:], more, axis=0)], dtype=float) for a in arguments)
     arrays = list(map(np.ascontiguousarray, filled))
     results = [np.zeros((blocks * BLOCK, function.size1_out(i))) for i in range(function.n_out())]
-    run = _accumulate_block(function)
+    run = _accumulate_block(_dense(function))
     for begin in range(0, blocks * BLOCK, BLOCK):
         block = slice(begin, begin + BLOCK)
         _call(run, [state, *(a[block] for a in arrays)], [out[block] for out in results])
@@ -456,10 +465,10 @@ def _connect(buffer: Any, arrays: Sequence[np.ndarray], results: Sequence[np.nda
 
 
 class Buffered:
-    """A function of dense arguments and results, to be called many times on the same memory."""
+    """A function of dense arguments, to be called many times on the same memory."""
 
     def __init__(self, function: ca.Function) -> None:
-        self.function = function
+        self.function = function = _dense(function)
         self._buffer, self._evaluate = function.buffer()
         self._arguments = [np.zeros((function.size2_in(i), function.size1_in(i))) for i in range(function.n_in())]
         self._results = [np.zeros((function.size2_out(i), function.size1_out(i))) for i in range(function.n_out())]

@@ -4,7 +4,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from pilfr_casadi.models import accumulate_steps, map_points
+from pilfr_casadi.models import Buffered, accumulate_steps, map_points
 from pilfr_casadi.models.model import BLOCK
 
 
@@ -43,3 +43,18 @@ def test_without_states():
     u = np.arange(5.0)[:, None]
     assert np.array_equal(map_points(step, np.zeros((5, 0)), u)[1][:, :, 0], 2 * u)
     assert np.array_equal(accumulate_steps(step, np.zeros(0), u)[1], 2 * u)
+
+
+def test_entries_that_a_function_does_not_store_are_zero():
+    """A buffer would keep what the memory held before."""
+    x, u = ca.SX.sym("x", 2), ca.SX.sym("u")
+    sparse = ca.vertcat(ca.SX(1, 1), u, ca.SX(1, 1))
+    function = ca.Function("sparse", [x, u], [x + u, sparse, ca.SX(2, 1)])
+    u_at = np.arange(1.0, 100.0)[:, None]
+    expected = np.column_stack([0 * u_at, u_at, 0 * u_at])
+    _, some, none = map_points(function, np.zeros((99, 2)), u_at)
+    assert np.array_equal(some[:, :, 0], expected) and not none.any()
+    _, some, none = accumulate_steps(function, np.zeros(2), u_at)
+    assert np.array_equal(some, expected) and not none.any()
+    _, some, none = Buffered(function)(np.zeros(2), np.array([3.0]))
+    assert np.array_equal(some, [0, 3, 0]) and not none.any()
