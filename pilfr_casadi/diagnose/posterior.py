@@ -39,6 +39,7 @@ from .fits.evidence import (
     OUTSIDE_CATALOGUE,
     STRAINED_ODDS,
     SURE,
+    capped,
     significance,
 )
 from .fits.floor import ABOVE_NOISE, Floor, times_white
@@ -145,16 +146,15 @@ def share_left(
 
     The hypothesis is by default the refit, and the noise the floor. The estimated floor may contain physics that
     nothing explains; the white noise is a lower limit of the noise. `least` is the multiple of the noise below which no
-    error counts. The error before is limited to the outputs' variance, because free-run errors can grow without limit.
-    `squares` (n_y,) are the fit's mean square errors on other data, if these are meant.
+    error counts. `squares` (n_y,) are the fit's mean square errors on other data, if these are meant.
     """
 
-    def pooled(squares: np.ndarray | float) -> float:
+    def pooled(squares: np.ndarray) -> float:
         return float(np.mean(squares / fitted.balance))
 
     noise = pooled((floor or search.floor).squares(search.bench.scale))
     left = pooled(fitted.squares if squares is None else squares)
-    most = min(pooled((before or search.root).fitted.squares), pooled(1.0))
+    most = pooled(capped((before or search.root).fitted.squares))
     return float(np.clip((max(left, least * noise) - noise) / max(most - noise, 1e-300), 0.0, 1.0))
 
 

@@ -123,14 +123,18 @@ class EffectiveSamples:
         return WRONG_MODEL_SAMPLES * self.count / (WRONG_MODEL_SAMPLES + wrong * self.count)
 
 
-def formula_tolerance(mismatch2: np.ndarray | float, noise2: np.ndarray | float) -> float:
+def capped(mismatch2: np.ndarray) -> np.ndarray:
+    """Limit the mean squares of a mismatch (n_y,) to the outputs' variance: a free run can be off by any factor."""
+    return np.minimum(mismatch2, 1.0)
+
+
+def formula_tolerance(mismatch2: np.ndarray, noise2: np.ndarray) -> float:
     """Compute the mean square error that any law may leave: no machine follows a formula exactly.
 
-    `mismatch2` and `noise2` are mean squares of the refit's residual and of the noise, in units of the outputs'
-    variance, of each output or pooled. A residual above the outputs' deviation counts as that: a simulator can be wrong
-    by any factor.
+    `mismatch2` and `noise2` are mean squares of the refit's residual and of the noise, (n_y,), in units of the outputs'
+    variance.
     """
-    return FORMULA_ERROR * max(float(np.mean(np.minimum(mismatch2, 1.0) - noise2)), 0.0)
+    return FORMULA_ERROR * max(float(np.mean(capped(mismatch2) - noise2)), 0.0)
 
 
 def all_sure(confidences: Iterable[float]) -> bool:

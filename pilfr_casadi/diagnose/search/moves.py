@@ -20,7 +20,7 @@ from ...laws import constant
 from ...simulators import ACTUATOR, PARAMETER, SENSOR, kind_of, name_at, port_name
 from ..faults.gates import CLEARLY_BETTER, Checked, Gate
 from ..faults.timing import TimeShift, find_time_shift
-from ..fits.evidence import BETTER_RATIO, FAR_RATIO, LEAST_FORMULA_ERROR
+from ..fits.evidence import BETTER_RATIO, FAR_RATIO, LEAST_FORMULA_ERROR, capped
 from ..fits.floor import ABOVE_NOISE
 from ..fits.linearise import linearise_runs
 from ..fits.screen import Remainder, Scored
@@ -122,7 +122,7 @@ class Search(Forms):
         An inexact formula can look like one more effect. The law is therefore kept only if the remaining residual can
         be white noise. Residuals below LEAST_FORMULA_ERROR are skipped.
         """
-        base, least = self.best, LEAST_FORMULA_ERROR * min(self.root.mean_square, 1.0)
+        base, least = self.best, LEAST_FORMULA_ERROR * self.bench.pool(capped(self.root.fitted.squares))
         is_noise = base.mean_square < ABOVE_NOISE**2 * self.least_noise2 + least
         if not base.laws or is_noise or base.mean_square > self.may_leave() or not self.may_go_on():
             return
