@@ -391,11 +391,6 @@ class Law:
             yield shape | own
 
     @classmethod
-    def shares_values(cls) -> bool:
-        """Tell whether values of another form are start values of this one as they are, as in most laws."""
-        return cls.finer_starts.__func__ is Law.finer_starts.__func__  # type: ignore[attr-defined]
-
-    @classmethod
     def extends(cls, found: type[Law]) -> bool:
         """Tell whether this form contains another one, or the base class that both contain; see `as_base`."""
         if "as_base" not in vars(cls) or cls is found:
