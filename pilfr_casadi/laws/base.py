@@ -376,11 +376,11 @@ class Law:
 
     @classmethod
     def finer_starts(cls, found: Law, local: Local) -> Iterator[dict[str, Any]]:
-        """Start values of this form for a law found in another form, with the means of strengths that vary.
+        """Start values of this form, by name and unit, for a law found in another form; strengths that vary have means.
 
         A form that contains the found law, or its base class, begins where it equals that.
         """
-        own = {name: value for name, value in found.values.items() if name in cls.units}
+        own = {name: value for name, value in found.values.items() if cls.units.get(name) == found.units[name]}
         for name in own:
             ends = [found.values[f"{name}{end}"] for end in ("", "_mid", "_high") if f"{name}{end}" in found.values]
             own[name] = np.mean(ends, axis=0)
