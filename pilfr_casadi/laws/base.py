@@ -202,8 +202,6 @@ class Law:
         except those in `signed`.
     flexible : bool
         The law can imitate many others, and is less likely before the data are seen.
-    contains : tuple of str
-        Ids of laws that are special cases of it, for the catalogue in the documentation.
     signed : tuple of str
         Strengths of a dissipative or restoring law that may have either sign.
     two_sided : bool
@@ -282,7 +280,6 @@ class Law:
     restoring: ClassVar[bool] = False
     two_sided: ClassVar[bool] = False
     flexible: ClassVar[bool] = False
-    contains: ClassVar[tuple[str, ...]] = ()
     signed: ClassVar[tuple[str, ...]] = ()
     order: ClassVar[int] = 0
     follows: ClassVar[int] = 0
