@@ -10,7 +10,7 @@ import numpy as np
 
 from .._base import listed, multiple, percent
 from ..data import DIVERGING, Recording
-from ..models import ParameterSet, is_at_bound
+from ..models import Parameter, ParameterSet, is_at_bound
 from ..simulators import Placed, Simulator, name_at, split_port
 from .blind_spots import BlindSpot
 from .correction import Correction
@@ -51,7 +51,7 @@ class NamelessLaw:
     name: str  # with its port, in words
     equation: str
     doubt: str  # what speaks against it; empty if nothing does
-    values: Mapping[str, tuple[str, str]]  # of the free parameters, with their units
+    free: Mapping[str, Parameter]  # the free parameters, at the fitted values
     alike: str  # the laws, with their ports, that explain the recordings about as well; empty if none does
 
 
@@ -361,7 +361,7 @@ class ResultText:
         for law in self.nameless_laws:
             lines += [f"in the correction, without a sure name: {law.name}"]
             lines += ["  " + "; ".join(filter(None, [law.equation, law.doubt]))]
-            lines += [f"  {name} = {value} {unit}".rstrip() for name, (value, unit) in law.values.items()]
+            lines += [f"  {name} = {value_with_unit(p.value, p.unit, 5)}" for name, p in law.free.items()]
             lines += [f"  cannot be told apart from {law.alike}"] if law.alike else []
         return lines
 
@@ -373,9 +373,8 @@ class ResultText:
             if e.law.listed:
                 own = {name: parameters[f"{e.prefix}{name}"] for name in e.law.parameters()}
                 free = {name: p for name, p in own.items() if not np.all(p.fixed)}
-                values = {name: (value_with_unit(p.value, "", 5), p.unit) for name, p in free.items()}
                 doubt, alike = self._acts_with_motion(e) * HELPS_MOTION, listed(self._alike(e), MOST_PRINTED)
-                out.append(NamelessLaw(name_at(e.port, e.law.id, e.law.form), e.law.equation, doubt, values, alike))
+                out.append(NamelessLaw(name_at(e.port, e.law.id, e.law.form), e.law.equation, doubt, free, alike))
         return out
 
     def _alike(self, e: Placed) -> list[str]:

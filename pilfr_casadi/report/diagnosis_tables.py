@@ -186,14 +186,12 @@ def effect_blocks(diagnosis: Diagnosis, number: int, action: Table | None) -> li
         out.append(action)
     if worth := diagnosis.worth(e):
         out.append(Text(f"{worth[0].upper()}{worth[1:]}."))
-    rows = [
-        [name, uncertain_text(p["value"], with_nan(p["std"])) + e.limit(name), p["unit"] or "–"]
+    values = {
+        name: (uncertain_text(p["value"], with_nan(p["std"])) + e.limit(name), p["unit"])
         for name, p in (e.defined | e.parameters).items()
-    ]
-    if rows:
-        given = any(np.isfinite(with_nan(p["std"])) for p in e.parameters.values())
-        note = "± one standard deviation." if given else ""
-        out.append(Table(["parameter", "value", "unit"], rows, note=note))
+    }
+    given = any(np.isfinite(with_nan(p["std"])) for p in e.parameters.values())
+    out += _value_table(values, "± one standard deviation." if given else "")
     if e.indistinguishable:
         others = "; ".join(name_at(port, law) for port, law in e.indistinguishable)
         out.append(Text(f"These recordings cannot tell it apart from: {others}."))
@@ -210,11 +208,17 @@ def nameless_blocks(diagnosis: Diagnosis) -> list[Block]:
     out = list[Block]()
     for law in diagnosis.nameless_laws:
         out += [Text(f"{law.name[0].upper()}{law.name[1:]}:"), Code(law.equation)]
-        rows = [[name, value, unit or "–"] for name, (value, unit) in law.values.items()]
-        out += [Table(["parameter", "value", "unit"], rows)] if rows else []
+        values = {name: (", ".join(map(number_text, np.ravel(p.value))), p.unit) for name, p in law.free.items()}
+        out += _value_table(values)
         out += [Text(f"{law.doubt[0].upper()}{law.doubt[1:]}.")] if law.doubt else []
         out += [Text(f"These recordings cannot tell it apart from {law.alike}.")] if law.alike else []
     return out
+
+
+def _value_table(values: Mapping[str, tuple[str, str]], note: str = "") -> list[Block]:
+    """Tabulate values with their units, by name; no table if there are none."""
+    rows = [[name, value, unit or "–"] for name, (value, unit) in values.items()]
+    return [Table(["parameter", "value", "unit"], rows, note=note)] if rows else []
 
 
 def candidates_by_pass(diagnosis: Diagnosis) -> list[tuple[list[dict[str, Any]], Any]]:
