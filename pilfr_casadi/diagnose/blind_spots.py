@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from .._base import in_words, multiple, one_blas_thread, percent, to_json
+from .._base import capitalise, in_words, multiple, one_blas_thread, percent, to_json
 from ..data import COURSES, HOLD_CHOICES, Recording, as_recordings, moves_freely
 from ..laws import LINEAR, Law, display_name
 from ..simulators import ACTUATOR, SENSOR, UNKNOWN, in_series, kind_of, port_name, split_port
@@ -461,7 +461,7 @@ def _followed_laws(found: Check, port: str) -> Iterator[BlindSpot]:
         rows = [r for r in followed if r.why == why]
         what = _describe_change(why) if any(why == p.name for p in found.parameters) else why
         names = in_words([display_name(r.law, r.form) for r in rows])
-        text = f"{names[0].upper()}{names[1:]} at {port} cannot be distinguished from {what}."
+        text = f"{capitalise(names)} at {port} cannot be distinguished from {what}."
         yield BlindSpot("followed", (port, *dict.fromkeys(r.law for r in rows)), text)
 
 

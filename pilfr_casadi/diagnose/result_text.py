@@ -374,7 +374,7 @@ class ResultText:
                 own = {name: parameters[f"{e.prefix}{name}"] for name in e.law.parameters()}
                 free = {name: p for name, p in own.items() if not np.all(p.fixed)}
                 doubt, alike = self._acts_with_motion(e) * HELPS_MOTION, listed(self._alike(e), MOST_PRINTED)
-                out.append(NamelessLaw(name_at(e.port, e.law.id, e.law.form), e.law.equation, doubt, free, alike))
+                out.append(NamelessLaw(e.words, e.law.equation, doubt, free, alike))
         return out
 
     def _alike(self, e: Placed) -> list[str]:

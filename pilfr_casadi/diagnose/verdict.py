@@ -13,7 +13,6 @@ import numpy as np
 
 from .._base import in_words, percent
 from ..laws import CATALOGUE, display_name
-from ..simulators import name_at
 from .faults.gates import Gate
 from .faults.offsets import find_placed_offsets
 from .faults.tones import find_ringing_mode
@@ -244,7 +243,7 @@ def _describe_unexplained(search: Hypotheses, closest: Trial, shares: dict[str, 
     # after the time limit, this may not be worth another minute
     looked = search.findings[closest.key].flexible is not None or not search.out_of_time
     rest = max(search.flexible(closest).values(), default=0.0) if looked else 0.0
-    words = " and ".join(name_at(e.port, e.law.id, e.law.form) for e in laws)
+    words = " and ".join(e.words for e in laws)
     named = f"laws, {words}, remove" if laws[1:] else f"law, {words}, removes"
     if left < FORMULA_ERROR:
         them, sure = ("they are", "names are") if laws[1:] else ("it is", "name is")

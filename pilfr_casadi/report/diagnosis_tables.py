@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from .. import identify, laws, simulators
-from .._base import percent, to_json, with_nan
+from .._base import capitalise, percent, to_json, with_nan
 from ..data import DIVERGING
 from ..diagnose import ERROR_NAMES, Diagnosis, Effect, Fitted, Workbench, law_signals, learned_force
 from ..laws import (
@@ -121,7 +121,7 @@ def answer(diagnosis: Diagnosis, forces: Sequence[str]) -> str:
     gain = ", ".join(f"{percent_text(errors.get(k))} {name}" for k, name in steps.items())
     worse = ", which is worse" if d.outcome == "worse" else ""
     data = "unseen data" if role == "test" else "the training data"
-    return f"{words[0].upper()}{words[1:]}; error on {data} {gain}{worse}"
+    return f"{capitalise(words)}; error on {data} {gain}{worse}"
 
 
 def headline(diagnosis: Diagnosis) -> str:
@@ -179,13 +179,13 @@ def effect_blocks(diagnosis: Diagnosis, number: int, action: Table | None) -> li
     e = diagnosis.effects[number]
     name = name_at(e.port, e.law, e.form)
     out: list[Block] = [
-        Text(f"{name[0].upper()}{name[1:]}. In words: {e.sentence}. Confidence {e.confidence:.2f} of 1{e.place}."),
+        Text(f"{capitalise(name)}. In words: {e.sentence}. Confidence {e.confidence:.2f} of 1{e.place}."),
         Code(e.equation),
     ]
     if action:
         out.append(action)
     if worth := diagnosis.worth(e):
-        out.append(Text(f"{worth[0].upper()}{worth[1:]}."))
+        out.append(Text(f"{capitalise(worth)}."))
     values = {
         name: (uncertain_text(p["value"], with_nan(p["std"])) + e.limit(name), p["unit"])
         for name, p in (e.defined | e.parameters).items()
@@ -207,10 +207,10 @@ def nameless_blocks(diagnosis: Diagnosis) -> list[Block]:
     """Describe the laws of a correction without a sure name: equations, values, and the laws that explain as much."""
     out = list[Block]()
     for law in diagnosis.nameless_laws:
-        out += [Text(f"{law.name[0].upper()}{law.name[1:]}:"), Code(law.equation)]
+        out += [Text(f"{capitalise(law.name)}:"), Code(law.equation)]
         values = {name: (", ".join(map(number_text, np.ravel(p.value))), p.unit) for name, p in law.free.items()}
         out += _value_table(values)
-        out += [Text(f"{law.doubt[0].upper()}{law.doubt[1:]}.")] if law.doubt else []
+        out += [Text(f"{capitalise(law.doubt)}.")] if law.doubt else []
         out += [Text(f"These recordings cannot tell it apart from {law.alike}.")] if law.alike else []
     return out
 

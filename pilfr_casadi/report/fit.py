@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from .. import plots
-from .._base import make_folder, multiple, write_atomically
+from .._base import capitalise, make_folder, multiple, write_atomically
 from ..data import DIVERGING, Recording, as_recordings, rmse_per_output
 from ..identify import Fit
 from ..linear import LinearPart, any_bla
@@ -207,7 +207,7 @@ def _subtitle(fit: Fit) -> str:
 
 def _search(fit: Fit) -> list[Block]:
     lines = [line.rstrip(".") for line in str(fit).splitlines()[1:] if line]
-    out: list[Block] = [Text(". ".join(line[0].upper() + line[1:] for line in lines) + ".")]
+    out: list[Block] = [Text(". ".join(map(capitalise, lines)) + ".")]
     if fit.solution.history or any(c.solution.history for c in fit.candidates):
         caption = "Training error over iterations: every start, and the last solve of the best one."
         out.append(Picture(plots.convergence(fit), caption, "Convergence of the starts."))

@@ -17,7 +17,7 @@ import numpy as np
 
 from ..._base import InputError
 from ...laws import constant
-from ...simulators import ACTUATOR, PARAMETER, SENSOR, kind_of, name_at, port_name
+from ...simulators import ACTUATOR, PARAMETER, SENSOR, kind_of, port_name
 from ..faults.gates import CLEARLY_BETTER, Checked, Gate
 from ..faults.timing import TimeShift, find_time_shift
 from ..fits.evidence import BETTER_RATIO, FAR_RATIO, LEAST_FORMULA_ERROR, capped
@@ -206,8 +206,7 @@ class Search(Forms):
                 found = find_time_shift(Checked(bench, trial.fitted), shift_step, given=False)
                 shift = found.gates[0] if found.gates else None
                 if isinstance(shift, TimeShift) and shift.leads and found.cost < best:
-                    beside = name_at(trial.port, trial.law.id, trial.law.form)
-                    sentence = f"{shift.sentence.rstrip('.')} (beside {beside})."
+                    sentence = f"{shift.sentence.rstrip('.')} (beside {trial.element.words})."
                     best, self.shift = found.cost, replace(shift, sentence=sentence)
         self.aligned = True
 
