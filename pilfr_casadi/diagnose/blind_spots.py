@@ -360,7 +360,7 @@ def assess_recordings(
         starts=tuple(START_WORDS[r.begins] for r in bench.recordings),
         switches=tuple(name for i, name in enumerate(inputs) if _is_switch([r.u[:, i] for r in bench.recordings])),
     )
-    swings = np.ptp(np.concatenate([r.u for r in bench.recordings]), axis=0)
+    swings = np.ptp(bench.stacked_inputs, axis=0)
     still = [name for name, swing in zip(inputs, swings, strict=True) if not swing > 0]
     spots = [
         *_find_blind_spots(found, still, _alive_as_given(quiet, fitted, parameters)),

@@ -185,7 +185,7 @@ def next_experiment(
     `frequency` (Hz), `separation` (rms difference over the noise), `recorded` (the separation in the recordings) and
     `sentence`; None if nothing within the limits separates them better than the recordings do.
     """
-    u = np.concatenate([r.u for r in bench.recordings])
+    u = bench.stacked_inputs
     m = min(max(map(len, bench.recordings)), LONGEST_EXPERIMENT)
     rest = np.median(u, axis=0)
     best: dict[str, Any] | None = None

@@ -198,7 +198,7 @@ def spread(bench: Workbench, fitted: Fitted, laws: Sequence[Placed], v: float, n
     if not np.any(fitted.model.parameters.free):
         return 0.0
     problem, _, recorded = _hessian(bench, fitted)
-    mean = np.mean(np.concatenate([r.u for r in bench.recordings]), axis=0)
+    mean = np.mean(bench.stacked_inputs, axis=0)
     smaller = [r.with_(u=mean + INPUT_FACTOR * (r.u - mean)) for r in bench.recordings]
     there, begun = bench.on(smaller), _begun_like(bench, fitted)
     *_, other = _hessian(there, begun)
@@ -259,7 +259,7 @@ def runs_away(bench: Workbench, fitted: Fitted, refitted: Fitted) -> bool:
     if bench.simulator.observer is not None:
         return False
     k = int(np.argmax([len(r) for r in bench.recordings]))
-    r, inputs = bench.recordings[k], np.concatenate([r.u for r in bench.recordings])
+    r, inputs = bench.recordings[k], bench.stacked_inputs
     rest, ends = np.mean(inputs, axis=0), (np.min(inputs, axis=0), np.max(inputs, axis=0))
 
     def reach(one: Fitted, u: np.ndarray) -> tuple[float, float]:
@@ -279,7 +279,7 @@ def runs_away(bench: Workbench, fitted: Fitted, refitted: Fitted) -> bool:
 
 def _amplification(bench: Workbench, fitted: Fitted) -> float:
     """Compute the mean square change of the outputs by a small perturbation, over that of the inputs."""
-    rng, size = np.random.default_rng(0), PERTURBATION * np.std(np.concatenate([r.u for r in bench.recordings]), axis=0)
+    rng, size = np.random.default_rng(0), PERTURBATION * np.std(bench.stacked_inputs, axis=0)
     perturbed = bench.on([r.with_(u=r.u + size * rng.standard_normal(r.u.shape)) for r in bench.recordings])
     try:
         with np.errstate(all="ignore"):
