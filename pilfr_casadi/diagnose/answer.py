@@ -20,7 +20,7 @@ from .blind_spots import BlindSpot, assess_recordings
 from .correction import Correction
 from .detectability import port_units
 from .effect import Effect
-from .extrapolation import range_note
+from .experiment import next_experiment
 from .faults.channels import IN_RECORDINGS, find_gross_channel_errors
 from .faults.gates import EQUAL_RATIO, TEST_FAULT, TEST_OFFSET, Gate, edited
 from .faults.offsets import Offset, describe_offsets, find_placed_offsets, remove_offsets, update_offsets
@@ -31,7 +31,7 @@ from .fits.workbench import Fitted, Workbench
 from .mismatch_map import mismatch
 from .posterior import LikelyEffect, hypotheses_named
 from .preparation import Prepared
-from .proof import Comparison, free_run_errors, next_experiment, parameter_table, placebo, test_errors
+from .proof import Comparison, free_run_errors, parameter_table, placebo, range_note, test_errors
 from .result import Diagnosis
 from .result_text import Basis
 from .search.moves import Search
@@ -421,7 +421,7 @@ def _design_experiment(
             having = stated or [t for t in search.memo.values() if effect.name in t.names]
             one = max(having, key=search.evidence)
             rivals = in_words([name_at(*pair, brief=True) for pair in (effect.name, name)])
-            best = next_experiment(search.bench, one.fitted, other.fitted, search.floor.deviation, limits, rivals)
+            best = next_experiment(search.bench, (one.fitted, other.fitted), search.floor.deviation, limits, rivals)
             tied = [list(effect.name), list(name)]
             if best is not None:
                 return {"between": tied, **best}

@@ -388,15 +388,14 @@ class ResultText:
     def _acts_with_motion(self, e: Placed) -> bool:
         """Tell whether friction or damping in an output, where it may have either sign, helps the motion."""
         law, simulator = e.law, self.corrected
-        if not law.dissipative or not set(simulator.into(simulator.port(e.port), *simulator.symbols())) <= set(
-            simulator.output_names
-        ):
+        if not law.dissipative:
             return False
-        opposing = [v for name, v in e.own(self._values()).items() if name in {*law.strength} - {*law.signed}]
+        moved = simulator.into(simulator.port(e.port), *simulator.symbols())
+        if not set(moved) <= set(simulator.output_names):
+            return False
+        names = {*law.strength} - {*law.signed}
+        opposing = [p.value for name, p in e.own(simulator.parameters).items() if name in names]
         return all(np.all(v <= 0) for v in opposing) and any(np.any(v < 0) for v in opposing)
-
-    def _values(self) -> dict[str, np.ndarray]:
-        return {name: np.asarray(p.value) for name, p in self.corrected.parameters.items()}
 
     def _value_lines(self) -> list[str]:
         """List the simulator's own estimated values, largest changes first."""

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .._base import in_words, percent
+from .._base import capitalise, in_words, percent
 from ..laws import CATALOGUE, display_name
 from .faults.gates import Gate
 from .faults.offsets import find_placed_offsets
@@ -206,37 +206,31 @@ def _explains_all(search: Hypotheses, laws: int) -> str:
     return f"{_which_laws(search)} explains all of it"
 
 
-def _describe_unexplained(search: Hypotheses, closest: Trial, shares: dict[str, float], mode: float | None) -> str:
-    root, share = search.root, max(shares.values(), default=0.0)
-    where = max(shares, key=lambda k: shares[k], default="")
-    laws, left = closest.effects, share_left(search, closest.fitted, floor=search.least_floor)
-    if not laws or 1 - left < LEAST_EXPLAINED:
+def _describe_far(search: Hypotheses, share: float, where: str, mode: float | None) -> str:
+    """Describe a mismatch that no law comes near; a force at a port, `where`, explains the `share` of it."""
+    estimated, rings, at = search.floor.source == "estimated", "", ""
+    if mode:
         rings = (
             f" The rest swings at the simulator's own {mode:.3g} Hz, as from a force that was not recorded or a value "
             "that varies in time."
-            if mode
-            else ""
         )
-        at = (
-            f" A force at {where} could explain {100 * share:.0f} % of the rest; it may also be one that was not "
-            "recorded."
-            if share > LEAST_EXPLAINED
-            else ""
-        )
-        noise = search.least_floor.nrmse(search.bench.scale)
-        least = "at least" if search.floor.source == "estimated" else "about"
-        large = (
-            search.floor.source == "estimated"
-            and share < LEAST_EXPLAINED
-            and times_of_noise(search) < WHITE_NOISE_RATIO
-        )
-        or_noise = ", or the noise is large and slow" if large and not mode else ""
-        refitted = _refitted(search).replace("refitted", "Refitted", 1)
-        return (
-            f"Physics is missing{or_noise}, and {_fails(search)}. {refitted}, the simulator is off by "
-            f"{percent(search.bench.nrmse(root.fitted))} of the outputs' deviation; the noise is {least} "
-            f"{percent(noise)}.{at}{rings}"
-        )
+    if share > LEAST_EXPLAINED:
+        explained = f"{100 * share:.0f} % of the rest"
+        at = f" A force at {where} could explain {explained}; it may also be one that was not recorded."
+    large = estimated and share < LEAST_EXPLAINED and times_of_noise(search) < WHITE_NOISE_RATIO
+    or_noise = ", or the noise is large and slow" if large and not mode else ""
+    return (
+        f"Physics is missing{or_noise}, and {_fails(search)}. {capitalise(_refitted(search))}, the simulator is off by "
+        f"{percent(search.bench.nrmse(search.root.fitted))} of the outputs' deviation; the noise is "
+        f"{'at least' if estimated else 'about'} {percent(search.least_floor.nrmse(search.bench.scale))}.{at}{rings}"
+    )
+
+
+def _describe_unexplained(search: Hypotheses, closest: Trial, shares: dict[str, float], mode: float | None) -> str:
+    share, where = max(shares.values(), default=0.0), max(shares, key=lambda k: shares[k], default="")
+    laws, left = closest.effects, share_left(search, closest.fitted, floor=search.least_floor)
+    if not laws or 1 - left < LEAST_EXPLAINED:
+        return _describe_far(search, share, where, mode)
     # a force at the laws' port explains what they remove, however little of it shows beside the linearised simulator
     there = max(shares.get(laws[0].port, 0.0), 1 - left)
     port = laws[0].port if there >= OTHER_PORT_SHARE * share else where
