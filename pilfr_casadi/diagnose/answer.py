@@ -340,7 +340,7 @@ def _make_effect(
     law = element.law
     own, unrelated = placebo(bench, search.root.fitted, element.port, law)
     port = bench.simulator.port(element.port)
-    remarks = [law.remark(element.own(fitted.values)), *_order(fitted, element)]
+    remarks = [law.remark(element.own(fitted.values)), *_describe_order(fitted, element)]
     if law.turns and is_curve_along(bench, final.drawn[1], fitted.simulator.elements.index(element)):
         remarks.append("these recordings do not show its memory: a curve follows them as well")
     if other_forms:
@@ -399,7 +399,7 @@ def _other_forms(search: Search, effects: Sequence[LikelyEffect], effect: Likely
     return [other for form, other in found.items() if form != law.form]
 
 
-def _order(fitted: Fitted, element: Placed) -> Iterator[str]:
+def _describe_order(fitted: Fitted, element: Placed) -> Iterator[str]:
     """Tell which laws of the same signal come before a law."""
     for e in fitted.simulator.elements:
         if e is element:

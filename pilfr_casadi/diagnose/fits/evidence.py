@@ -123,7 +123,7 @@ class EffectiveSamples:
         return WRONG_MODEL_SAMPLES * self.count / (WRONG_MODEL_SAMPLES + wrong * self.count)
 
 
-def capped(mismatch2: np.ndarray) -> np.ndarray:
+def cap_mismatch(mismatch2: np.ndarray) -> np.ndarray:
     """Limit the mean squares of a mismatch (n_y,) to the outputs' variance: a free run can be off by any factor."""
     return np.minimum(mismatch2, 1.0)
 
@@ -134,7 +134,7 @@ def formula_tolerance(mismatch2: np.ndarray, noise2: np.ndarray) -> float:
     `mismatch2` and `noise2` are mean squares of the refit's residual and of the noise, (n_y,), in units of the outputs'
     variance.
     """
-    return FORMULA_ERROR * max(float(np.mean(capped(mismatch2) - noise2)), 0.0)
+    return FORMULA_ERROR * max(float(np.mean(cap_mismatch(mismatch2) - noise2)), 0.0)
 
 
 def all_sure(confidences: Iterable[float]) -> bool:
@@ -200,7 +200,7 @@ def spread(bench: Workbench, fitted: Fitted, laws: Sequence[Placed], v: float, n
     problem, _, recorded = _hessian(bench, fitted)
     mean = np.mean(bench.stacked_inputs, axis=0)
     smaller = [r.with_(u=mean + INPUT_FACTOR * (r.u - mean)) for r in bench.recordings]
-    there, begun = bench.on(smaller), _begun_like(bench, fitted)
+    there, begun = bench.on(smaller), _shrink_initial_states(bench, fitted)
     *_, other = _hessian(there, begun)
     free = int(problem.free.sum())
     if not (np.all(np.isfinite(recorded)) and np.all(np.isfinite(other))):
@@ -229,7 +229,7 @@ def spread(bench: Workbench, fitted: Fitted, laws: Sequence[Placed], v: float, n
     return found / max(now / as_recorded, 1.0) if 0 < as_recorded < np.inf and now < np.inf else found
 
 
-def _begun_like(bench: Workbench, fitted: Fitted) -> Fitted:
+def _shrink_initial_states(bench: Workbench, fitted: Fitted) -> Fitted:
     """Return a fit whose estimated initial states are nearer to each run's mean state by INPUT_FACTOR.
 
     With the recorded state, a motion that inputs and state cancel as recorded, such as a hardly damped vibration, would
