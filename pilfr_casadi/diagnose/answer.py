@@ -335,6 +335,7 @@ def _make_effect(
     other_forms: Sequence[Law],
     test_without: float,
 ) -> Effect:
+    """Make the effect that an answer states, at the values of the final fit, with its placebo and its remarks."""
     bench, fitted = search.bench, final.after
     element = next(e for e in fitted.simulator.elements if e.name == named.name)  # its form may differ
     law = element.law

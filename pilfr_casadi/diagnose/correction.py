@@ -175,7 +175,7 @@ def find_unnamed_correction(search: Search) -> tuple[Correction, Fitted]:
 def _grow(search: Search, validated: list[_Validated]) -> list[_Validated]:
     """Add laws to the correction as long as that predicts better.
 
-    Of a model that is wrong throughout, few samples count, so that no second law is worth its prior; on data that were
+    Few samples count for a model that is wrong throughout, so that no second law is worth its prior; on data that were
     left out it may be clearly better. The search did not look beyond such a correction.
     """
     while (chosen := _choose(validated)[0].base).laws and len(chosen.effects) < search.most_effects:
@@ -281,7 +281,7 @@ def _likely_hypotheses(search: Search) -> list[Trial]:
 def _polish(search: Search, trials: Sequence[Trial]) -> list[_Candidate]:
     """Make candidates of hypotheses, fitted to convergence.
 
-    Those that run away at a held input are left out, though their laws may be right in the range of the recordings.
+    Hypotheses that run away at a held input are left out, though their laws may be right where the recordings are.
     """
     found = list[Trial]()
     for trial in trials:

@@ -165,7 +165,7 @@ def _undetectable(
 ) -> LawRow:
     """Say why a law is not detectable: it is weak at the largest local force, or own parameters imitate it.
 
-    Of several parameters, the one is named without which the most would be left.
+    If several parameters imitate it, the one without which most would be left is named.
     """
     response = phi[:, np.argmax(lengths(phi))]
     size = float(np.linalg.norm(response))

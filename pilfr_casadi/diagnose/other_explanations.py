@@ -125,6 +125,7 @@ def _left_bounds(search: Search, names: Sequence[str], found: Fitted) -> bool:
 
 
 def _describe_pinned(search: Search, names: Sequence[str], found: Fitted, named: Sequence[Placed]) -> str:
+    """Describe the pinned parameters with the values that they have once they are freed."""
     without, errors = search.root.fitted, map(search.bench.nrmse, (search.root.fitted, found))
     parts = []
     for name in names:
@@ -265,6 +266,7 @@ def _by_half(bench: Workbench, whole: Fitted) -> list[Group]:
 
 
 def _compare_groups(search: Search, groups: Sequence[Group], where: str) -> Gate | None:
+    """Fit each group alone; note the values that differ if this follows far better than one set of values."""
     bench, whole = search.bench, search.root.fitted
     fits, benches = list[Fitted](), list[Workbench]()
     for _, recordings, states in groups:

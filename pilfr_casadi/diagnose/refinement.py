@@ -356,6 +356,7 @@ def _initial_state(after: Fitted, state: np.ndarray, number: int, law: Law, z: f
 def _build_refinement(
     diagnosis: Any, bench: Workbench, kind: str, fitted: Fitted, number: int, expected: Mapping[str, ExpectedError]
 ) -> Refinement:
+    """Compare a fitted layer with the diagnosed law, and keep the one that is expected to predict better."""
     element, after = fitted.simulator.elements[number], diagnosis.evidence.after
     values, port = element.own(fitted.values), element.port
     refined = diagnosis.with_fit(fitted)

@@ -135,6 +135,7 @@ def _is_noise(search: Hypotheses, quiet: float, explained: bool, mode: float | N
 
 
 def _describe_effects(search: Hypotheses, found: Posterior) -> str:
+    """Name the effects, those with a sure name first."""
     sure, unsure = (
         " and ".join(e.words for e in found.effects if (e.confidence > SURE) is known) for known in (True, False)
     )
@@ -227,6 +228,7 @@ def _describe_far(search: Hypotheses, share: float, where: str, mode: float | No
 
 
 def _describe_unexplained(search: Hypotheses, closest: Trial, shares: dict[str, float], mode: float | None) -> str:
+    """Describe the likeliest port of an unexplained mismatch, and how much of it the closest laws remove."""
     share, where = max(shares.values(), default=0.0), max(shares, key=lambda k: shares[k], default="")
     laws, left = closest.effects, share_left(search, closest.fitted, floor=search.least_floor)
     if not laws or 1 - left < LEAST_EXPLAINED:

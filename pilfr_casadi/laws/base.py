@@ -190,7 +190,7 @@ class Law:
     absent : tuple of domain
         Physical domains in which it cannot occur; there it is not tried.
     sentences : mapping
-        What it is in a physical domain, if `sentence` does not say it there.
+        Description of the law in a physical domain, if `sentence` does not say it there.
     special : bool
         It is tried only at ports of its domains, and not where the domain is unknown.
     across : str

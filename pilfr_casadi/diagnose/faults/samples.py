@@ -102,7 +102,7 @@ def mend(r: Recording) -> Recording:
 def find_glitches(y: np.ndarray, u: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Find single samples far off their neighbours, shape (k,); return them and the output without them.
 
-    Those at a pulse of one of the inputs u (M, n_u), or one sample later, may be the answer to it, and are left.
+    Samples at a pulse of one of the inputs u (M, n_u), or one sample later, may be the answer to it, and stay.
     """
     clean, found = np.array(y), np.zeros(0, dtype=int)
     inputs = [(v, distances(v)) for v in ([] if u is None else u.T)]
@@ -271,7 +271,7 @@ def _is_fine(values: np.ndarray) -> bool:
 def _find_frozen(v: np.ndarray, u: np.ndarray) -> np.ndarray:
     """Find begin and end (behind it) of the long stretches of one value of a channel that end by its largest step.
 
-    Those count in which one of the inputs u (M, n_u) moves, and which are not at the beginning or at a limit.
+    A stretch counts if one of the inputs u (M, n_u) moves in it, and if it is not at the beginning or at a limit.
     """
     steps, moving = np.abs(np.diff(v)), np.any(np.diff(u, axis=0) != 0, axis=1)
     stretches = [(b, e) for b, e in find_stretches(steps == 0) if e - b > LONGEST_REST and b > 0 and e < len(steps)]

@@ -354,6 +354,10 @@ class Workbench:
         path: tuple[float, ...],
         solver: GaussNewton,
     ) -> tuple[float, np.ndarray, Problem, Status] | None:
+        """Fit from one start through injection gains down to none; None if it diverges.
+
+        A large gain keeps the run near the recordings, so that a poor start does not end in a wrong minimum.
+        """
         model, parameters = one.model, one.model.parameters
         vector = start_vector(model, start)
         states = [model.first_state(r) for r in self.recordings]
