@@ -146,7 +146,9 @@ class Check:
 
     def __str__(self) -> str:
         lines = [*self._error_lines(), ""]
-        lines += ["Blind spots of these recordings:"] if self.blind_spots else [self._none_found()]
+        # near wrong values, finding none says little
+        near = " near the refitted values, which what is missing may distort" * (self._times_of_noise > ABOVE_NOISE)
+        lines += ["Blind spots of these recordings:" if self.blind_spots else f"No blind spot was found{near}."]
         lines += [f"- {b.sentence}" for b in self.blind_spots]
         lines += ["", *self._parameter_lines(), "", *self._law_lines()]
         if groups := [] if self.rough else list(self._group_lines()):
@@ -157,11 +159,6 @@ class Check:
     @property
     def _times_of_noise(self) -> float:
         return self.error / max(float(np.mean(list(self.noise["share"].values()))), 1e-300)
-
-    def _none_found(self) -> str:
-        """Say that there is no blind spot; near wrong values that says little."""
-        near = " near the refitted values, which what is missing may distort" * (self._times_of_noise > ABOVE_NOISE)
-        return f"No blind spot was found{near}."
 
     def _error_lines(self) -> Iterator[str]:
         """State the error of the refitted simulator, and what follows if it is above the noise."""
