@@ -25,6 +25,15 @@ KINDS = {
     "thermal": "Heat flows",
     "electrical": "Currents and voltages",
 }
+# ids of the laws that are special cases of a law
+SPECIAL_CASES = {
+    "clearance": ("linear_stiffness", "piecewise_stiffness"),
+    "creep": ("linear_stiffness", "viscous_damping"),
+    "extra_mode": ("linear_stiffness", "viscous_damping"),
+    "hysteresis": ("backlash", "coulomb_friction", "linear_stiffness"),
+    "piecewise_stiffness": ("linear_stiffness",),
+    "stribeck_friction": ("coulomb_friction",),
+}
 # units of w and z, by the name of a law or by its first domain
 UNITS = {
     "Overpotential": ("V", "A"),
@@ -193,8 +202,8 @@ def page(law_id: str, laws: list[type[Law]], alike: dict[type[Law], list[tuple[s
         heading(title),
         f"A diagnosis says: *The simulator leaves out {name} at {port}.* In results it is ``{law_id}``.\n",
     ]
-    special = sorted({c for law in laws for c in law.contains})
-    general = sorted({law.id for law in CATALOGUE if law_id in law.contains})
+    special = SPECIAL_CASES.get(law_id, ())
+    general = [name for name, cases in SPECIAL_CASES.items() if law_id in cases]
     if special:
         text.append(f"Its special cases: {', '.join(map(link, special))}.\n")
     if general:

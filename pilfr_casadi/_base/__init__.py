@@ -23,6 +23,7 @@ if TYPE_CHECKING:
         LARGEST as LARGEST,
         REPAIR as REPAIR,
         InputError as InputError,
+        capitalise as capitalise,
         check_known as check_known,
         existing_file as existing_file,
         filled as filled,

@@ -51,6 +51,11 @@ def in_words(names: Sequence[str]) -> str:
     return " and ".join([", ".join(names[:-1]), names[-1]]) if len(names) > 1 else "".join(names)
 
 
+def capitalise(text: str) -> str:
+    """Write the first letter of a text as a capital; the others, as of names and units, stay."""
+    return text[:1].upper() + text[1:]
+
+
 def percent(share: float) -> str:
     """Write a share or a relative error, "12.3 %"; a large one without an exponent, an infinite one in words."""
     if not np.isfinite(share):

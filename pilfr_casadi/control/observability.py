@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from .._base import InputError, numbers
+from .._base import InputError, capitalise, numbers
 from ..diagnose import Diagnosis
 from ..export import Exported, exported
 from ..identify import Fit
@@ -169,4 +169,4 @@ def _name_memory(fit: Any, model: Exported) -> tuple[str, dict[int, str]]:
             shown = f"{i + 1}{f' of channel {channel + 1}' if element.channels > 1 else ''}"
         out[place] = shown if r is None else f"{shown} (r = {r:.3g})"
     kind = element.operator.name.replace("_", " ") if isinstance(element, PrandtlIshlinskii) else "memory"
-    return f"{kind[0].upper()}{kind[1:]}", out
+    return capitalise(kind), out

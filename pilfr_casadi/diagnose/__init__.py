@@ -13,8 +13,8 @@ about. Folders and files by stage:
 - Answer: `posterior` turns the evidences into probabilities, and `verdict` these into a verdict. `correction` chooses
   the corrected simulator, with a learned force where named laws do not suffice. `other_explanations` weighs a pinned
   value, an undeclared port, and a machine that changed.
-- Proof: `proof` (errors before and after, placebo, next experiment), `extrapolation` (where test recordings go beyond
-  the training recordings), `mismatch_map`.
+- Proof: `proof` (errors before and after, placebo, where test recordings go beyond the training recordings),
+  `experiment` (the next one), `mismatch_map`.
 - Result: `answer` puts it together, `result` is what users hold, `result_text` what it says, an `effect` is a law that
   was found, and `refinement` puts a Prandtl-Ishlinskii layer in place of the hysteresis that was found.
 - After a diagnosis: `replication` fits laws that were found to the recordings of further machines.

@@ -20,7 +20,7 @@ from .blind_spots import BlindSpot, assess_recordings
 from .correction import Correction
 from .detectability import port_units
 from .effect import Effect
-from .extrapolation import range_note
+from .experiment import next_experiment
 from .faults.channels import IN_RECORDINGS, find_gross_channel_errors
 from .faults.gates import EQUAL_RATIO, TEST_FAULT, TEST_OFFSET, Gate, edited
 from .faults.offsets import Offset, describe_offsets, find_placed_offsets, remove_offsets, update_offsets
@@ -31,7 +31,7 @@ from .fits.workbench import Fitted, Workbench
 from .mismatch_map import mismatch
 from .posterior import LikelyEffect, hypotheses_named
 from .preparation import Prepared
-from .proof import Comparison, free_run_errors, next_experiment, parameter_table, placebo, test_errors
+from .proof import Comparison, free_run_errors, parameter_table, placebo, range_note, test_errors
 from .result import Diagnosis
 from .result_text import Basis
 from .search.moves import Search
@@ -335,12 +335,13 @@ def _make_effect(
     other_forms: Sequence[Law],
     test_without: float,
 ) -> Effect:
+    """Make the effect that an answer states, at the values of the final fit, with its placebo and its remarks."""
     bench, fitted = search.bench, final.after
     element = next(e for e in fitted.simulator.elements if e.name == named.name)  # its form may differ
     law = element.law
     own, unrelated = placebo(bench, search.root.fitted, element.port, law)
     port = bench.simulator.port(element.port)
-    remarks = [law.remark(element.own(fitted.values)), *_order(fitted, element)]
+    remarks = [law.remark(element.own(fitted.values)), *_describe_order(fitted, element)]
     if law.turns and is_curve_along(bench, final.drawn[1], fitted.simulator.elements.index(element)):
         remarks.append("these recordings do not show its memory: a curve follows them as well")
     if other_forms:
@@ -399,7 +400,7 @@ def _other_forms(search: Search, effects: Sequence[LikelyEffect], effect: Likely
     return [other for form, other in found.items() if form != law.form]
 
 
-def _order(fitted: Fitted, element: Placed) -> Iterator[str]:
+def _describe_order(fitted: Fitted, element: Placed) -> Iterator[str]:
     """Tell which laws of the same signal come before a law."""
     for e in fitted.simulator.elements:
         if e is element:
@@ -421,7 +422,7 @@ def _design_experiment(
             having = stated or [t for t in search.memo.values() if effect.name in t.names]
             one = max(having, key=search.evidence)
             rivals = in_words([name_at(*pair, brief=True) for pair in (effect.name, name)])
-            best = next_experiment(search.bench, one.fitted, other.fitted, search.floor.deviation, limits, rivals)
+            best = next_experiment(search.bench, (one.fitted, other.fitted), search.floor.deviation, limits, rivals)
             tied = [list(effect.name), list(name)]
             if best is not None:
                 return {"between": tied, **best}

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from .._base import in_words, multiple, one_blas_thread, percent, to_json
+from .._base import capitalise, in_words, multiple, one_blas_thread, percent, to_json
 from ..data import COURSES, HOLD_CHOICES, Recording, as_recordings, moves_freely
 from ..laws import LINEAR, Law, display_name
 from ..simulators import ACTUATOR, SENSOR, UNKNOWN, in_series, kind_of, port_name, split_port
@@ -146,7 +146,9 @@ class Check:
 
     def __str__(self) -> str:
         lines = [*self._error_lines(), ""]
-        lines += ["Blind spots of these recordings:"] if self.blind_spots else [self._none_found()]
+        # near wrong values, finding none says little
+        near = " near the refitted values, which what is missing may distort" * (self._times_of_noise > ABOVE_NOISE)
+        lines += ["Blind spots of these recordings:" if self.blind_spots else f"No blind spot was found{near}."]
         lines += [f"- {b.sentence}" for b in self.blind_spots]
         lines += ["", *self._parameter_lines(), "", *self._law_lines()]
         if groups := [] if self.rough else list(self._group_lines()):
@@ -157,11 +159,6 @@ class Check:
     @property
     def _times_of_noise(self) -> float:
         return self.error / max(float(np.mean(list(self.noise["share"].values()))), 1e-300)
-
-    def _none_found(self) -> str:
-        """Say that there is no blind spot; near wrong values that says little."""
-        near = " near the refitted values, which what is missing may distort" * (self._times_of_noise > ABOVE_NOISE)
-        return f"No blind spot was found{near}."
 
     def _error_lines(self) -> Iterator[str]:
         """State the error of the refitted simulator, and what follows if it is above the noise."""
@@ -360,7 +357,7 @@ def assess_recordings(
         starts=tuple(START_WORDS[r.begins] for r in bench.recordings),
         switches=tuple(name for i, name in enumerate(inputs) if _is_switch([r.u[:, i] for r in bench.recordings])),
     )
-    swings = np.ptp(np.concatenate([r.u for r in bench.recordings]), axis=0)
+    swings = np.ptp(bench.stacked_inputs, axis=0)
     still = [name for name, swing in zip(inputs, swings, strict=True) if not swing > 0]
     spots = [
         *_find_blind_spots(found, still, _alive_as_given(quiet, fitted, parameters)),
@@ -461,7 +458,7 @@ def _followed_laws(found: Check, port: str) -> Iterator[BlindSpot]:
         rows = [r for r in followed if r.why == why]
         what = _describe_change(why) if any(why == p.name for p in found.parameters) else why
         names = in_words([display_name(r.law, r.form) for r in rows])
-        text = f"{names[0].upper()}{names[1:]} at {port} cannot be distinguished from {what}."
+        text = f"{capitalise(names)} at {port} cannot be distinguished from {what}."
         yield BlindSpot("followed", (port, *dict.fromkeys(r.law for r in rows)), text)
 
 

@@ -158,7 +158,7 @@ def find_unnamed_correction(search: Search) -> tuple[Correction, Fitted]:
     contain error that no law explains, so that shares are relative to the least noise.
     """
     refit = _cross_validate(search, [_Candidate.of(search, search.root)])
-    candidates = [_Candidate.of(search, t) for t in _hypotheses_with_laws(search)]
+    candidates = _polish(search, _likely_hypotheses(search))
     validated = _compare(search, candidates, refit)
     if not validated:
         stays = _far_better(search, candidates)
@@ -175,7 +175,7 @@ def find_unnamed_correction(search: Search) -> tuple[Correction, Fitted]:
 def _grow(search: Search, validated: list[_Validated]) -> list[_Validated]:
     """Add laws to the correction as long as that predicts better.
 
-    Of a model that is wrong throughout, few samples count, so that no second law is worth its prior; on data that were
+    Few samples count for a model that is wrong throughout, so that no second law is worth its prior; on data that were
     left out it may be clearly better. The search did not look beyond such a correction.
     """
     while (chosen := _choose(validated)[0].base).laws and len(chosen.effects) < search.most_effects:
@@ -184,9 +184,7 @@ def _grow(search: Search, validated: list[_Validated]) -> list[_Validated]:
         search.add(chosen)
         more = [t for t in search.memo.values() if t.names > chosen.names and len(t.effects) == len(chosen.effects) + 1]
         best = sorted((t for t in more if _may_recur(search, t)), key=lambda t: t.mean_square)[:FEW]
-        candidates = [_Candidate.of(search, search.thorough(t)) for t in best]
-        candidates = [c for c in candidates if not runs_away(search.bench, c.fitted, search.without)]
-        validated = _cross_validate(search, candidates, validated)
+        validated = _cross_validate(search, _polish(search, best), validated)
     return validated
 
 
@@ -273,19 +271,24 @@ def _sure_names(answer: Posterior) -> frozenset[Name]:
     return frozenset(e.name for e in answer.effects if e.confidence > SURE)
 
 
-def _hypotheses_with_laws(search: Search) -> list[Trial]:
-    """List the hypotheses with laws that may correct: the likeliest, and of those not yet polished only a few.
-
-    Those that run away at a held input are left out, though their laws may be right in the range of the recordings.
-    """
-    found, recurring = list[Trial](), [t for t in search.memo.values() if _may_recur(search, t)]
+def _likely_hypotheses(search: Search) -> list[Trial]:
+    """List the likeliest hypotheses with laws that may recur; of those not yet polished, only a few."""
+    recurring = [t for t in search.memo.values() if _may_recur(search, t)]
     likely = sorted(likeliest(recurring, search.optimistic_evidence), key=search.evidence, reverse=True)
-    for i, trial in enumerate(t for t in likely if t.laws):
-        if trial.thorough or i < FEW:
-            with suppress(InputError):
-                found.append(search.thorough(trial))
+    return [t for i, t in enumerate(t for t in likely if t.laws) if t.thorough or i < FEW]
+
+
+def _polish(search: Search, trials: Sequence[Trial]) -> list[_Candidate]:
+    """Make candidates of hypotheses, fitted to convergence.
+
+    Hypotheses that run away at a held input are left out, though their laws may be right where the recordings are.
+    """
+    found = list[Trial]()
+    for trial in trials:
+        with suppress(InputError):
+            found.append(search.thorough(trial))
     finite = (t for t in found if np.isfinite(t.mean_square))
-    return [t for t in finite if not runs_away(search.bench, t.fitted, search.without)]
+    return [_Candidate.of(search, t) for t in finite if not runs_away(search.bench, t.fitted, search.without)]
 
 
 def _learned_candidates(search: Search, base: Trial, taken: Collection[str] = ()) -> list[_Candidate]:

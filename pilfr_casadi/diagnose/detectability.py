@@ -84,28 +84,43 @@ def assess_laws(
     responses: list[_Response] = []
     for task in rest.tasks:
         wanted = tried.get(task.port.name, ())
-        if not wanted:
-            continue
-        whole, task = task, replace(task, pairs=[(law, shapes) for law, shapes in task.pairs if type(law) in wanted])
-        if not task.pairs:
+        chosen = replace(task, pairs=[(law, shapes) for law, shapes in task.pairs if type(law) in wanted])
+        if not chosen.pairs:
             continue
         assess = partial(_assess_port, rest, base=base, own=(own, needed), level=levels[task.index], names=names)
-        for form, row, response in assess(task):
+        for form, row, response in assess(chosen):
             if laws is None and row.status == "followed" and row.law not in LINEAR:
-                # a root may look like a gain where a free curve does not
-                others = [pair for pair in whole.pairs if pair[0].id == row.law and type(pair[0]) not in wanted]
-                assessed = (found for pair in others for found in assess(replace(task, pairs=[pair])))
-                seen_form = next((found for found in assessed if found[1].status == "detectable"), None)
-                _, row, response = seen_form or (form, row, None)
+                row, response = _find_detectable_form(assess, task, row, wanted)
             rows.append(row if laws is None else replace(row, form=form))
             responses += [response] if response else []
-        seen = {type(law) for law, _ in task.pairs}
-        for law in (law for law in wanted if law not in seen):
-            jumps = np.ptp(task.local.z) > 0 and not np.any(task.local.dz)
-            still = "its coordinate jumps and has no rate, like a held input" if jumps else "its signals do not change"
-            why = law().why_not(task.local) or still
-            rows.append(LawRow(task.port.name, law.id, "no data", why=why, form=law.form if laws else ""))
+        rows += _rows_without_data(chosen, wanted, named=laws is not None)
     return tuple(rows), _group_responses(responses)
+
+
+def _find_detectable_form(
+    assess: Callable[[Task], Iterable[tuple[str, LawRow, _Response | None]]],
+    task: Task,
+    followed: LawRow,
+    wanted: Sequence[type[Law]],
+) -> tuple[LawRow, _Response | None]:
+    """Return the first other form of an imitated law that is detectable, else the law itself.
+
+    A root may look like a gain where a free curve does not.
+    """
+    others = [pair for pair in task.pairs if pair[0].id == followed.law and type(pair[0]) not in wanted]
+    assessed = (found for pair in others for found in assess(replace(task, pairs=[pair])))
+    found = ((row, response) for _, row, response in assessed if row.status == "detectable")
+    return next(found, (followed, None))
+
+
+def _rows_without_data(task: Task, wanted: Sequence[type[Law]], named: bool) -> Iterator[LawRow]:
+    """Generate a row for each wanted law on which the data at a port carry no information, with its form if `named`."""
+    tried = {type(law) for law, _ in task.pairs}
+    jumps = np.ptp(task.local.z) > 0 and not np.any(task.local.dz)
+    still = "its coordinate jumps and has no rate, like a held input" if jumps else "its signals do not change"
+    for law in (law for law in wanted if law not in tried):
+        why = law().why_not(task.local) or still
+        yield LawRow(task.port.name, law.id, "no data", why=why, form=law.form if named else "")
 
 
 def _select_laws(port: Port, laws: Sequence[type[Law]] | None) -> tuple[type[Law], ...]:
@@ -165,7 +180,7 @@ def _undetectable(
 ) -> LawRow:
     """Say why a law is not detectable: it is weak at the largest local force, or own parameters imitate it.
 
-    Of several parameters, the one is named without which the most would be left.
+    If several parameters imitate it, the one without which most would be left is named.
     """
     response = phi[:, np.argmax(lengths(phi))]
     size = float(np.linalg.norm(response))

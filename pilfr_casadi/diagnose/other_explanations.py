@@ -78,11 +78,11 @@ def find_pinned_parameters(search: Search, answer: Posterior) -> PinnedParameter
     best = without
     while len(freed) < min(len(pinned), most):
         if len(freed) == 1:
-            together = _free(search, pinned, best, enough)  # if all of them do not suffice, no subset does
+            together = _refit_freed(search, pinned, best, enough)  # if all of them do not suffice, no subset does
             if together is None or together.cost > NEAR_RATIO**2 * enough:
                 return None
-        found = {name: _free(search, [*freed, name], best, enough) for name in pinned if name not in freed}
-        gained = {name: f for name, f in found.items() if f is not None and _went_beyond(search, (*freed, name), f)}
+        found = {name: _refit_freed(search, [*freed, name], best, enough) for name in pinned if name not in freed}
+        gained = {name: f for name, f in found.items() if f is not None and _left_bounds(search, (*freed, name), f)}
         if search.interrupted or not gained:
             return None
         name = min(gained, key=lambda n: gained[n].cost)
@@ -96,7 +96,7 @@ def find_pinned_parameters(search: Search, answer: Posterior) -> PinnedParameter
     return None
 
 
-def _free(search: Search, names: Sequence[str], start: Fitted, enough: float) -> Fitted | None:
+def _refit_freed(search: Search, names: Sequence[str], start: Fitted, enough: float) -> Fitted | None:
     """Refit with some pinned parameters freed; None if the fit fails or there is no time."""
     if search.past_deadline:
         return None
@@ -117,7 +117,7 @@ def _free(search: Search, names: Sequence[str], start: Fitted, enough: float) ->
     return None if search.interrupted else found
 
 
-def _went_beyond(search: Search, names: Sequence[str], found: Fitted) -> bool:
+def _left_bounds(search: Search, names: Sequence[str], found: Fitted) -> bool:
     """Tell whether each freed value is one that the pinned parameter could not have."""
     own = search.bench.simulator.parameters
     ends = [(own[n], float(found.values[n])) for n in names]
@@ -125,6 +125,7 @@ def _went_beyond(search: Search, names: Sequence[str], found: Fitted) -> bool:
 
 
 def _describe_pinned(search: Search, names: Sequence[str], found: Fitted, named: Sequence[Placed]) -> str:
+    """Describe the pinned parameters with the values that they have once they are freed."""
     without, errors = search.root.fitted, map(search.bench.nrmse, (search.root.fitted, found))
     parts = []
     for name in names:
@@ -265,6 +266,7 @@ def _by_half(bench: Workbench, whole: Fitted) -> list[Group]:
 
 
 def _compare_groups(search: Search, groups: Sequence[Group], where: str) -> Gate | None:
+    """Fit each group alone; note the values that differ if this follows far better than one set of values."""
     bench, whole = search.bench, search.root.fitted
     fits, benches = list[Fitted](), list[Workbench]()
     for _, recordings, states in groups:

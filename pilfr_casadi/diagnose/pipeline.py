@@ -80,7 +80,7 @@ def diagnose_in_steps(request: Request) -> Diagnosis:
     request, first = search_with_repetitions(_on_stretches(request))
     ready, search = first.ready, first.search
     request, everything = _fit_to_everything(request, ready, search)
-    found = _concluded(search, (*request.notes, *ready.gates))
+    found = _draw_conclusion(search, (*request.notes, *ready.gates))
     if found.verdict.kind == "unexplained" and request.focus is None:
         with search.until_interrupted():
             again = _advise_predictions if search.cut_short else _name_in_predictions
@@ -154,7 +154,7 @@ def _refit_as_given(request: Request, search: Search) -> Fitted:
 # the conclusion
 
 
-def _concluded(search: Search, gates: Sequence[Gate]) -> Conclusion:
+def _draw_conclusion(search: Search, gates: Sequence[Gate]) -> Conclusion:
     """Draw the conclusion; after an interrupt, draw it without further fits."""
     found = None
     with search.until_interrupted():
@@ -177,7 +177,7 @@ def conclude(search: Search, gates: Sequence[Gate]) -> Conclusion:
     """
     answer, elsewhere = posterior(search), tuple[Gate, ...]()
     interrupted, finished = search.interrupted, not search.cut_short
-    judged = _Judged.of(search, answer, gates)
+    judged = _Judgement.of(search, answer, gates)
     if judged.kind in ("missing-physics", "unexplained") and not search.past_deadline:
         found = _conclude_without_a_law(search, judged)
         if found is not None:
@@ -200,7 +200,7 @@ def conclude(search: Search, gates: Sequence[Gate]) -> Conclusion:
 
 
 @dataclass(frozen=True, eq=False)
-class _Judged:
+class _Judgement:
     """A posterior, the notes beside it, and the verdict on both."""
 
     answer: Posterior
@@ -208,9 +208,9 @@ class _Judged:
     verdict: Verdict
 
     @classmethod
-    def of(cls, search: Search, answer: Posterior, gates: Sequence[Gate]) -> _Judged:
+    def of(cls, search: Search, answer: Posterior, gates: Sequence[Gate]) -> _Judgement:
         """Judge a posterior, with the steady tones that its laws leave among the notes."""
-        noted = with_tones(search, answer, gates)
+        noted = add_tones(search, answer, gates)
         return cls(answer, noted, judge(search, answer, noted))
 
     @property
@@ -219,13 +219,13 @@ class _Judged:
         return self.verdict.kind
 
 
-def with_tones(search: Search, answer: Posterior, gates: Sequence[Gate]) -> tuple[Gate, ...]:
+def add_tones(search: Search, answer: Posterior, gates: Sequence[Gate]) -> tuple[Gate, ...]:
     """Add the steady tones in the residual of the named laws, or of the refit if nothing is named."""
     fitted = answer.best.fitted if answer.effects else search.root.fitted
     return (*gates, *find_tones(search.bench, fitted))
 
 
-def _conclude_without_a_law(search: Search, judged: _Judged) -> Conclusion | None:
+def _conclude_without_a_law(search: Search, judged: _Judgement) -> Conclusion | None:
     """Conclude that a parameter has a wrong pinned value, or an input was clipped, if that explains as much as laws."""
     answer, gates = judged.answer, judged.gates
     held = find_pinned_parameters(search, answer)
@@ -247,21 +247,21 @@ def _conclude_without_a_law(search: Search, judged: _Judged) -> Conclusion | Non
 
 def _weigh_names(
     search: Search, answer: Posterior, correction: Correction, gates: Sequence[Gate], finished: bool
-) -> tuple[_Judged, tuple[Gate, ...]]:
+) -> tuple[_Judgement, tuple[Gate, ...]]:
     """Weigh names against a learned force and, after a finished search, against laws where no port is declared.
 
     Also returns the note about such a law.
     """
     answer = answer.within({(port, law) for port, law, _ in correction.elements}, correction.shares["learned"])
-    judged = _Judged.of(search, answer, gates)
+    judged = _Judgement.of(search, answer, gates)
     if judged.kind != "missing-physics" or not finished or not may_act_elsewhere(search, answer.best):
         return judged, ()
     elsewhere, odds = find_undeclared_port(search, answer.best)
-    return _Judged.of(search, answer.against(odds), gates), elsewhere
+    return _Judgement.of(search, answer.against(odds), gates), elsewhere
 
 
 def _conclude_named(
-    search: Search, judged: _Judged, elsewhere: Sequence[Gate], correction: Correction, fitted: Fitted
+    search: Search, judged: _Judgement, elsewhere: Sequence[Gate], correction: Correction, fitted: Fitted
 ) -> Conclusion:
     """State the named effects, and the offsets beside them."""
     sentence = f"{judged.verdict.sentence} {correction.sentence}" if correction.learned else judged.verdict.sentence
@@ -269,7 +269,7 @@ def _conclude_named(
     return Conclusion(Verdict(judged.kind, sentence), notes, fitted, correction, judged.answer.effects)
 
 
-def _conclude_interrupted(search: Search, judged: _Judged, came_to_an_answer: bool) -> Conclusion:
+def _conclude_interrupted(search: Search, judged: _Judgement, came_to_an_answer: bool) -> Conclusion:
     """State what an interrupted search leaves: a correction without a name, or the refitted simulator."""
     correction, fitted = find_unnamed_correction(search)
     error = percent(search.bench.nrmse(search.root.fitted))
@@ -280,7 +280,7 @@ def _conclude_interrupted(search: Search, judged: _Judged, came_to_an_answer: bo
     return Conclusion(Verdict(judged.kind, sentence), judged.gates, fitted, correction)
 
 
-def _conclude_unexplained(search: Search, judged: _Judged, elsewhere: Sequence[Gate]) -> Conclusion:
+def _conclude_unexplained(search: Search, judged: _Judgement, elsewhere: Sequence[Gate]) -> Conclusion:
     """State the law that is closest to an unexplained mismatch, or the law that explains it at an undeclared port."""
     correction, fitted = find_unnamed_correction(search)
     verdict = judge(search, judged.answer, judged.gates, correction.closest)
@@ -317,7 +317,7 @@ def _name_in_predictions(request: Request, search: Search, found: Conclusion) ->
     search.cut_short_with(predicting)
     if predicting.interrupted:
         return found
-    named, answer = _concluded(predicting, ()), posterior(predicting)
+    named, answer = _draw_conclusion(predicting, ()), posterior(predicting)
     best = answer.best
     if named.verdict.kind != "missing-physics" or {e.name for e in named.effects} != best.names:
         return _advise_predictions(request, search, found, begun=True) if predicting.cut_short else found

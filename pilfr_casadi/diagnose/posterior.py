@@ -39,6 +39,7 @@ from .fits.evidence import (
     OUTSIDE_CATALOGUE,
     STRAINED_ODDS,
     SURE,
+    cap_mismatch,
     significance,
 )
 from .fits.floor import ABOVE_NOISE, Floor, times_white
@@ -100,7 +101,7 @@ class Posterior:
 
     def acting(self, search: Hypotheses, trial: Trial) -> Posterior:
         """Weigh the effects by the probability that their strengths are not zero in a fit of the same laws."""
-        acts = {e.name: _acts(search, trial, e) for e in trial.effects}
+        acts = {e.name: _probability_not_zero(search, trial, e) for e in trial.effects}
         effects = tuple(e.times(acts[e.name]) for e in self.effects)
         return replace(self, named=max(acts.values()) * self.named, effects=effects)
 
@@ -145,16 +146,15 @@ def share_left(
 
     The hypothesis is by default the refit, and the noise the floor. The estimated floor may contain physics that
     nothing explains; the white noise is a lower limit of the noise. `least` is the multiple of the noise below which no
-    error counts. The error before is limited to the outputs' variance, because free-run errors can grow without limit.
-    `squares` (n_y,) are the fit's mean square errors on other data, if these are meant.
+    error counts. `squares` (n_y,) are the fit's mean square errors on other data, if these are meant.
     """
 
-    def pooled(squares: np.ndarray | float) -> float:
+    def pooled(squares: np.ndarray) -> float:
         return float(np.mean(squares / fitted.balance))
 
     noise = pooled((floor or search.floor).squares(search.bench.scale))
     left = pooled(fitted.squares if squares is None else squares)
-    most = min(pooled((before or search.root).fitted.squares), pooled(1.0))
+    most = pooled(cap_mismatch((before or search.root).fitted.squares))
     return float(np.clip((max(left, least * noise) - noise) / max(most - noise, 1e-300), 0.0, 1.0))
 
 
@@ -210,7 +210,7 @@ def _odds_against(search: Hypotheses, trial: Trial, elements: Sequence[Placed]) 
     return STRAINED_ODDS**strained * (float(np.exp(-DOUBTFUL_PRIOR)) if degenerate else 1.0)
 
 
-def _acts(search: Hypotheses, best: Trial, element: Placed) -> float:
+def _probability_not_zero(search: Hypotheses, best: Trial, element: Placed) -> float:
     """Compute the probability that a law's strengths are not zero; the law's first state could imitate its force."""
     names = [f"{element.prefix}{name}" for name in element.law.strength]
     return significance(search.bench, best.fitted, names) if names else 1.0

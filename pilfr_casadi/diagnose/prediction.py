@@ -34,7 +34,7 @@ from ..data import Recording
 from ..linear import steady_state_gain
 from ..simulators import Simulator, discretise, growth_rate
 from .faults.gates import LEAST_GAIN, USELESS_FIT, Gate, evidence_gain
-from .fits.linearise import linearise_runs
+from .fits.linearise import differentiate_step, linearise_runs
 from .fits.workbench import FEW, Fitted, Workbench, growth, refit
 from .search.hypotheses import Hypotheses, likeliest_forms
 from .search.trials import Trial
@@ -202,9 +202,8 @@ def observer(simulator: Simulator, recordings: Sequence[Recording], hold: str, m
     """
     bench = Workbench.of(simulator, recordings, hold)
     model = discretise(simulator, bench.dt, hold, bench.substeps)
-    x, u, p = ca.SX.sym("x", model.n_state), ca.SX.sym("u", model.n_u), ca.SX.sym("p", model.parameters.size)
-    following, y = model.closed(x, u, p)
-    slopes = ca.Function("slopes", [x, u, p], [ca.jacobian(following, x), ca.jacobian(y, x)])
+    symbols, (_, by_state, _, seen, _) = differentiate_step(model)
+    slopes = ca.Function("slopes", symbols, [by_state, seen])
     r, begun = bench.recordings[0], np.zeros(model.n_state)
     if not isinstance(r.initial, str):
         begun[: len(r.initial)] = r.initial

@@ -1,4 +1,4 @@
-"""Errors and parameters before and after the correction, the placebo test of a law, and the next experiment."""
+"""Errors and parameters before and after the correction, the placebo test of a law, and where test data go beyond."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from .._base import multiple
+from .._base import in_words, percent
 from ..data import Recording, nrmse
 from ..engine import make_engine
 from ..identify import run_free
@@ -18,19 +18,16 @@ from ..models import Model
 from ..optimise import StatePrior
 from ..simulators import Simulator, discretise
 from .faults.gates import Gate, edited, value_with_unit
-from .fits.evidence import BETTER_RATIO
+from .fits.evidence import BEYOND_RANGE, NEW_DENSITY, NEW_SHARE
 from .fits.floor import effective_size
 from .fits.linearise import linearise_runs, simulate_states
 from .fits.screen import RIDGES, Remainder, held_out
 from .fits.workbench import Fitted, Workbench
 
 PRIOR_SAMPLES = 20_000  # samples of the training runs at most, about, that a prior of initial states is taken from
-AMPLITUDES = (0.1, 0.3, 1.0)  # amplitudes tried, as shares of the largest
-SINES, TRIANGLES = 12, 5  # frequencies that are tried
-LONGEST_EXPERIMENT = 3000  # longest simulated experiment, in samples
 LEAST_MOTION = 0.5  # deviation of an output's scored samples over that of all, below which it hardly moves
-VISIBLE_LEVEL = 0.1  # mean of an input over its amplitude, above which a sentence states it
-VISIBLE_DIFFERENCE = 0.01  # difference of two answers over the noise, above which a recording shows it
+ROUNDED = 1e-6  # change of a channel, over its size, that counts as none
+LONGEST_SEGMENT = 512  # samples from which a spectral density is computed
 
 
 @dataclass(frozen=True)
@@ -170,107 +167,6 @@ def parameter_table(
     return out
 
 
-def next_experiment(
-    bench: Workbench,
-    one: Fitted,
-    other: Fitted,
-    noise: np.ndarray,
-    limits: Mapping[str, float] | None = None,
-    rivals: str = "the two",
-) -> dict[str, Any] | None:
-    """Find the input that separates two fitted explanations, the `rivals`, best.
-
-    `noise` (n_y,) is the deviation of the outputs' noise; `limits` are the largest amplitudes of inputs, by default
-    such that they stay within their recorded range. Returns `input`, `waveform`, `level` (its mean), `amplitude`,
-    `frequency` (Hz), `separation` (rms difference over the noise), `recorded` (the separation in the recordings) and
-    `sentence`; None if nothing within the limits separates them better than the recordings do.
-    """
-    u = np.concatenate([r.u for r in bench.recordings])
-    m = min(max(map(len, bench.recordings)), LONGEST_EXPERIMENT)
-    rest = np.median(u, axis=0)
-    best: dict[str, Any] | None = None
-    swings = np.zeros(len(noise))
-
-    def simulated(drive: np.ndarray) -> list[np.ndarray]:
-        recording = bench.recordings[0].with_(
-            u=drive, y=np.zeros((len(drive), len(noise))), initial="zero", period=None, skip=0
-        )
-        with np.errstate(all="ignore"):
-            return [f.simulate(recording, np.zeros(f.model.n_state)) for f in (one, other)]
-
-    def separation(y: Sequence[np.ndarray]) -> float:
-        with np.errstate(all="ignore"):
-            value = float(np.sqrt(np.mean(((y[0] - y[1]) / np.maximum(noise, 1e-300)) ** 2)))
-        return value if np.isfinite(value) else 0.0
-
-    for i, name in enumerate(bench.simulator.inputs):
-        low, high = float(np.min(u[:, i])), float(np.max(u[:, i]))
-        most = (limits or {}).get(name, (high - low) / 2)
-        for waveform, f, wave in _waves(m, bench.dt):
-            for share in AMPLITUDES:
-                amplitude, drive = share * most, np.tile(rest, (m, 1))
-                # near its usual value, but within what was recorded: many inputs, such as a heater's, have one sign
-                least, largest = sorted((low + amplitude, high - amplitude))
-                level = float(np.clip(rest[i], least, largest))
-                drive[:, i] = level + amplitude * wave
-                y = simulated(drive)
-                value = separation(y)
-                if best is None or value > BETTER_RATIO * best["separation"]:
-                    best = {
-                        "input": name,
-                        "waveform": waveform,
-                        "level": level,
-                        "amplitude": amplitude,
-                        "frequency": f,
-                        "separation": value,
-                    }
-                    swings = np.max([np.ptp(one, axis=0) for one in y], axis=0)
-    if best is None or best["separation"] < 1.0:
-        return None
-    recorded = max(separation(simulated(r.u[:m])) for r in bench.recordings)
-    if best["separation"] < BETTER_RATIO * recorded:
-        return None
-    sentence = _describe_experiment(bench, best, recorded, rivals) + _describe_travel(bench, swings)
-    return {**best, "recorded": recorded, "sentence": sentence}
-
-
-def _waves(m: int, dt: float) -> Iterator[tuple[str, float, np.ndarray]]:
-    """Generate the waveforms to try: name, frequency in Hz, and `m` samples of unit amplitude."""
-    t = np.arange(m) * dt
-    for f in np.geomspace(4 / (m * dt), 0.2 / dt, SINES).tolist():
-        yield "sine", f, np.sin(2 * np.pi * f * t)
-    for f in np.geomspace(2 / (m * dt), 0.02 / dt, TRIANGLES).tolist():
-        yield "triangle", f, 2 / np.pi * np.arcsin(np.sin(2 * np.pi * f * t))
-
-
-def _describe_experiment(bench: Workbench, best: Mapping[str, Any], recorded: float, rivals: str) -> str:
-    """Describe an experiment; `recorded` is the separation in the recordings."""
-    unit = bench.unit_of(best["input"])
-    so_far = f"by {multiple(recorded)} times" if recorded > VISIBLE_DIFFERENCE else "not at all"
-    about = abs(best["level"]) > VISIBLE_LEVEL * best["amplitude"]
-    swing = value_with_unit(best["amplitude"], unit)
-    level = f" about {value_with_unit(best['level'], unit)}" if about else ""
-    return (
-        f"A {best['waveform']} of {best['frequency']:.3g} Hz with amplitude {swing}{level} at "
-        f"{best['input']} separates {rivals} best: their outputs then differ by {best['separation']:.3g} times the "
-        f"noise (in these recordings {so_far})."
-    )
-
-
-def _describe_travel(bench: Workbench, swings: np.ndarray) -> str:
-    """Warn of the output that would leave most the range over which it was recorded, if one would."""
-    known = np.max([np.ptp(r.y, axis=0) for r in bench.recordings], axis=0)
-    i = int(np.argmax(swings / np.maximum(known, 1e-300)))
-    if not swings[i] > known[i]:
-        return ""
-    name = bench.simulator.output_names[i]
-    unit = bench.unit_of(name)
-    return (
-        f" By the simulation {name} would vary over {value_with_unit(swings[i], unit)}; in these recordings it varies "
-        f"over {value_with_unit(known[i], unit)}."
-    )
-
-
 def placebo(bench: Workbench, fitted: Fitted, port: str, law: Law) -> tuple[float, float]:
     """Compute the held-out share of the residual that a law explains with its own signal, and with an unrelated one.
 
@@ -282,3 +178,58 @@ def placebo(bench: Workbench, fitted: Fitted, port: str, law: Law) -> tuple[floa
         return 0.0, 0.0
     own, unrelated = (rest.columns(rest.tasks[0], shifted)[0] for shifted in (False, True))
     return held_out(own, rest.left, rest.odd, RIDGES), held_out(unrelated, rest.left, rest.odd, RIDGES)
+
+
+# where the corrected simulator extrapolates
+
+
+def range_note(bench: Workbench, tests: Sequence[Recording]) -> Iterator[Gate]:
+    """Note the channels of the test recordings with values or frequencies that the training recordings do not have."""
+    simulator, trained, words = bench.simulator, bench.recordings, list[str]()
+    names = (*simulator.inputs, *simulator.output_names)
+    both = (np.concatenate([np.hstack([r.u, r.y])[r.skip :] for r in each]) for each in (trained, tests))
+    for i, value, limit in ranges_left(*both):
+        reached, known = (value_with_unit(v, bench.unit_of(names[i])) for v in (value, limit))
+        words.append(f"{names[i]} reaches {reached} ({known} in training)")
+    for i, name in enumerate(simulator.inputs):
+        before, now = ([r.u[r.skip :, i] for r in each] for each in (trained, tests))
+        share = share_at_new_frequencies(before, now, bench.dt)
+        if share > NEW_SHARE:
+            words.append(f"{percent(share)} of {name} is at frequencies that it hardly has in training")
+    if words:
+        advice = "There the corrected simulator extrapolates; train it on recordings like these, too."
+        sentence = f"The test recordings go beyond the training recordings: {in_words(words)}. {advice}"
+        yield Gate("recordings", "test range", None, sentence, False)
+
+
+def ranges_left(trained: np.ndarray, tested: np.ndarray) -> list[tuple[int, float, float]]:
+    """Find channels that leave their trained range by more than a tenth: number, farthest value, limit of the range.
+
+    Both signals have one column for each channel.
+    """
+    found = []
+    for i, (known, signal) in enumerate(zip(trained.T, tested.T, strict=True)):
+        low, high, least, most = (float(f(x)) for x in (known, signal) for f in (np.min, np.max))
+        value, limit = (most, high) if most - high > low - least else (least, low)
+        beyond = max(most - high, low - least)
+        if beyond > max(BEYOND_RANGE * (high - low), ROUNDED * max(abs(low), abs(high))):
+            found.append((i, value, limit))
+    return found
+
+
+def share_at_new_frequencies(trained: Sequence[np.ndarray], tested: Sequence[np.ndarray], dt: float) -> float:
+    """Compute the share of a signal's variance at frequencies that have 100 times less of the trained one's variance.
+
+    Each signal has one array (M,) for each recording.
+    """
+    from scipy.signal import welch
+
+    if all(np.ptp(u) <= ROUNDED * np.max(np.abs(u)) for u in tested):
+        return 0.0
+    length = min(LONGEST_SEGMENT, *map(len, trained), *map(len, tested))
+    known, now = (
+        np.average([welch(u, 1 / dt, nperseg=length)[1] for u in signals], axis=0, weights=[len(u) for u in signals])
+        for signals in (trained, tested)
+    )
+    known, now = (density / max(np.sum(density), 1e-300) for density in (known, now))
+    return float(np.sum(now[known < NEW_DENSITY * now]))

@@ -188,7 +188,7 @@ def refine(diagnosis: Any, operators: int, kind: str | None, port: str | None) -
         raise InputError(
             f"operators = {n} was given for {samples} training samples; give at most {max(samples // PER_OPERATOR, 1)}."
         )
-    number = _found_hysteresis(diagnosis, after, len(search.bench.simulator.elements), port)
+    number = _find_hysteresis(diagnosis, after, len(search.bench.simulator.elements), port)
     element = after.simulator.elements[number]
     series = in_series(element.port)
     kinds: tuple[str, ...] = ("play", "stop", "generalized_play") if series else ("stop", "play")
@@ -228,7 +228,7 @@ def _predict(search: Search, fitted: Fitted) -> ExpectedError:
     return ExpectedError(found, spread(bench, fitted, search.added_laws(fitted), v, n) if np.isfinite(v) else np.inf)
 
 
-def _found_hysteresis(diagnosis: Any, after: Fitted, given: int, port: str | None) -> int:
+def _find_hysteresis(diagnosis: Any, after: Fitted, given: int, port: str | None) -> int:
     """Return the index of the surest law with rate-independent memory (at the port, if one is given)."""
     elements = after.simulator.elements
     found = [i for i in range(given, len(elements)) if _is_hysteretic(elements[i].law)]
@@ -356,6 +356,7 @@ def _initial_state(after: Fitted, state: np.ndarray, number: int, law: Law, z: f
 def _build_refinement(
     diagnosis: Any, bench: Workbench, kind: str, fitted: Fitted, number: int, expected: Mapping[str, ExpectedError]
 ) -> Refinement:
+    """Compare a fitted layer with the diagnosed law, and keep the one that is expected to predict better."""
     element, after = fitted.simulator.elements[number], diagnosis.evidence.after
     values, port = element.own(fitted.values), element.port
     refined = diagnosis.with_fit(fitted)

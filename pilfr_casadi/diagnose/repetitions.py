@@ -109,7 +109,7 @@ def _search_forgetting_sooner(
     sooner_request = _with_observer(
         replace(request, say=request.say.under("shorter memory: ")), observed, shorter, note
     )
-    other = _again(first, partial(search, sooner_request))
+    other = _repeat(first, partial(search, sooner_request))
     if other is None:
         return found
     before2, after2 = first.compared_with(other)
@@ -140,7 +140,7 @@ def _search_with_better_hold(request: Request, first: Attempt, hold: str) -> Att
     """Search with a hold that the best hypothesis prefers; keep the search with the smaller error, and note it."""
     search = first.search
     held = replace(request, hold=hold, say=request.say.under("other hold: "))
-    other = _again(first, partial(search_with_one_hold, held))
+    other = _repeat(first, partial(search_with_one_hold, held))
     if other is None:
         if not search.hold_settled:
             search.resume()
@@ -189,7 +189,7 @@ def search_with_one_hold(request: Request) -> Attempt:
     leads = any(isinstance(g, TimeShift) and g.leads for g in first.ready.gates)
     if not leads or search.cut_short or not search.can_improve(search.best):
         return first
-    other = _again(first, partial(_search_once, request, correct_early=False))
+    other = _repeat(first, partial(_search_once, request, correct_early=False))
     if other is None:
         return first
     before2, after2 = first.compared_with(other)
@@ -206,7 +206,7 @@ def _search_realigned(request: Request, first: Attempt, shift: Gate) -> Attempt:
     moved = replace(request.corrected((*edits, shift), first.ready.nominal, "shifted: "), aligned=True)
     search = first.search
     search.shift, search.aligned = None, True
-    other = _again(first, partial(_search_once, moved, correct_early=True))
+    other = _repeat(first, partial(_search_once, moved, correct_early=True))
     if other is None:
         if not search.interrupted:
             search.run(request.most_effects)
@@ -225,7 +225,7 @@ def _search_from_unknown_start(request: Request, first: Attempt, start: WrongSta
     unknown, free initial states and an offset together make up for a part of it.
     """
     opened = request.corrected((start,), first.ready.nominal, "unknown start: ")
-    other = _again(first, partial(_search_once, opened, correct_early=True))
+    other = _repeat(first, partial(_search_once, opened, correct_early=True))
     if other is None:
         return request, first
     again = other.search
@@ -238,7 +238,7 @@ def _search_from_unknown_start(request: Request, first: Attempt, start: WrongSta
     return request, first
 
 
-def _again(first: Attempt, prepare_and_search: Callable[[], Attempt]) -> Attempt | None:
+def _repeat(first: Attempt, prepare_and_search: Callable[[], Attempt]) -> Attempt | None:
     """Prepare and search once more; None if an interrupt came before that search began, or the simulator diverges.
 
     If that search is cut short, so is the present one.

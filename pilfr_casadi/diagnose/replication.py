@@ -143,7 +143,8 @@ def replicate(
     alone, values = _fit_each_recording(bench, after)
     bench.interrupt.raise_pending()
     residuals = tuple(e / bench.scale for e in bench.scored(alone))
-    noise2 = _noise2(bench, residuals)
+    squares2 = _noise2(bench, residuals)
+    noise2 = bench.pool(squares2)
     square = bench.pool(np.mean(np.concatenate(residuals) ** 2, axis=0))
     total = sum(e.size for e in residuals)
     # repeats and periods determine the noise at least as well as third differences
@@ -159,7 +160,7 @@ def replicate(
         noise=float(np.sqrt(noise2)),
         remainder=float(0.5 * np.log(max(square, 1e-300) / max(noise2, 1e-300))),
         remainder_error=float(np.sqrt(variance)),
-        gain=_gain(bench, plain, after, after.last_elements(len(laws)), noise2) if laws else 0.0,
+        gain=_gain(bench, plain, after, after.last_elements(len(laws)), squares2) if laws else 0.0,
         residuals=residuals,
     )
 
@@ -213,20 +214,20 @@ def _fit_each_recording(bench: Workbench, after: Fitted) -> tuple[list[np.ndarra
     return residuals, tuple(values)
 
 
-def _noise2(bench: Workbench, residuals: Sequence[np.ndarray]) -> float:
-    """Return the mean square noise in units of the outputs' variance: measured, else by third differences."""
+def _noise2(bench: Workbench, residuals: Sequence[np.ndarray]) -> np.ndarray:
+    """Return the mean square noise (n_y,) in units of the outputs' variance: measured, else by third differences."""
     measured = measured_floor(bench.recordings)
     if measured is not None:
-        return bench.pool(measured.squares(bench.scale))
-    return bench.pool(np.mean(np.concatenate([third_differences(e) for e in residuals]) ** 2, axis=0))
+        return measured.squares(bench.scale)
+    return np.asarray(np.mean(np.concatenate([third_differences(e) for e in residuals]) ** 2, axis=0))
 
 
-def _gain(bench: Workbench, plain: Fitted, after: Fitted, laws: tuple[Placed, ...], noise2: float) -> float:
+def _gain(bench: Workbench, plain: Fitted, after: Fitted, laws: tuple[Placed, ...], noise2: np.ndarray) -> float:
     """Compute the log evidence with the laws minus the log evidence of the simulator as given."""
-    tolerance = formula_tolerance(plain.cost, noise2)
+    tolerance = formula_tolerance(plain.squares, noise2)
     costs = plain.cost + tolerance, after.cost + tolerance
     count = count_samples(bench.scored(after.residual), bench.scored(plain.residual), bench.scale)
-    n = EffectiveSamples(noise2 + tolerance, count).at(min(costs))
+    n = EffectiveSamples(bench.pool(noise2) + tolerance, count).at(min(costs))
     known = information(bench, after, laws)
     return log_evidence(costs[1], known, log_prior(laws, {}), n) - log_evidence(costs[0], np.zeros(0), 0.0, n)
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from .._base import listed, multiple, percent
 from ..data import DIVERGING, Recording
-from ..models import ParameterSet, is_at_bound
+from ..models import Parameter, ParameterSet, is_at_bound
 from ..simulators import Placed, Simulator, name_at, split_port
 from .blind_spots import BlindSpot
 from .correction import Correction
@@ -51,7 +51,7 @@ class NamelessLaw:
     name: str  # with its port, in words
     equation: str
     doubt: str  # what speaks against it; empty if nothing does
-    values: Mapping[str, tuple[str, str]]  # of the free parameters, with their units
+    free: Mapping[str, Parameter]  # the free parameters, at the fitted values
     alike: str  # the laws, with their ports, that explain the recordings about as well; empty if none does
 
 
@@ -361,7 +361,7 @@ class ResultText:
         for law in self.nameless_laws:
             lines += [f"in the correction, without a sure name: {law.name}"]
             lines += ["  " + "; ".join(filter(None, [law.equation, law.doubt]))]
-            lines += [f"  {name} = {value} {unit}".rstrip() for name, (value, unit) in law.values.items()]
+            lines += [f"  {name} = {value_with_unit(p.value, p.unit, 5)}" for name, p in law.free.items()]
             lines += [f"  cannot be told apart from {law.alike}"] if law.alike else []
         return lines
 
@@ -373,9 +373,8 @@ class ResultText:
             if e.law.listed:
                 own = {name: parameters[f"{e.prefix}{name}"] for name in e.law.parameters()}
                 free = {name: p for name, p in own.items() if not np.all(p.fixed)}
-                values = {name: (value_with_unit(p.value, "", 5), p.unit) for name, p in free.items()}
                 doubt, alike = self._acts_with_motion(e) * HELPS_MOTION, listed(self._alike(e), MOST_PRINTED)
-                out.append(NamelessLaw(name_at(e.port, e.law.id, e.law.form), e.law.equation, doubt, values, alike))
+                out.append(NamelessLaw(e.words, e.law.equation, doubt, free, alike))
         return out
 
     def _alike(self, e: Placed) -> list[str]:
@@ -389,15 +388,14 @@ class ResultText:
     def _acts_with_motion(self, e: Placed) -> bool:
         """Tell whether friction or damping in an output, where it may have either sign, helps the motion."""
         law, simulator = e.law, self.corrected
-        if not law.dissipative or not set(simulator.into(simulator.port(e.port), *simulator.symbols())) <= set(
-            simulator.output_names
-        ):
+        if not law.dissipative:
             return False
-        opposing = [v for name, v in e.own(self._values()).items() if name in {*law.strength} - {*law.signed}]
+        moved = simulator.into(simulator.port(e.port), *simulator.symbols())
+        if not set(moved) <= set(simulator.output_names):
+            return False
+        names = {*law.strength} - {*law.signed}
+        opposing = [p.value for name, p in e.own(simulator.parameters).items() if name in names]
         return all(np.all(v <= 0) for v in opposing) and any(np.any(v < 0) for v in opposing)
-
-    def _values(self) -> dict[str, np.ndarray]:
-        return {name: np.asarray(p.value) for name, p in self.corrected.parameters.items()}
 
     def _value_lines(self) -> list[str]:
         """List the simulator's own estimated values, largest changes first."""

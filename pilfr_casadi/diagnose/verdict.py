@@ -11,9 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .._base import in_words, percent
+from .._base import capitalise, in_words, percent
 from ..laws import CATALOGUE, display_name
-from ..simulators import name_at
 from .faults.gates import Gate
 from .faults.offsets import find_placed_offsets
 from .faults.tones import find_ringing_mode
@@ -81,7 +80,7 @@ def judge(search: Hypotheses, found: Posterior, gates: Sequence[Gate], closest: 
     if fault and (noise or cured):
         return Verdict("recording-fault", fault.sentence)
     if noise:
-        beside = _describe_beside(search, steady) + _among_laws(search)
+        beside = _describe_beside(search, steady) + _describe_allowed_laws(search)
         rest = "no force at any port explains any of the rest"
         if measured:
             rest = "the rest is as large as the noise"
@@ -89,8 +88,8 @@ def judge(search: Hypotheses, found: Posterior, gates: Sequence[Gate], closest: 
             rest = "the rest is slow noise: hardly any force explains its changes from sample to sample"
         return Verdict(
             "complete",
-            f"Nothing is missing{beside}: {_refitted(search)}, the simulator follows the recordings to {percent(off)} "
-            f"of the outputs' deviation, and {rest}.",
+            f"Nothing is missing{beside}: {_describe_refit(search)}, the simulator follows the recordings to "
+            f"{percent(off)} of the outputs' deviation, and {rest}.",
         )
     closest = closest_hypothesis(search, closest) or found.best
     return Verdict("unexplained", _describe_unexplained(search, closest, shares, mode))
@@ -103,7 +102,7 @@ def _describe_beside(search: Hypotheses, tones: Sequence[Gate]) -> str:
     return f" but {in_words(found)}" if found else ""
 
 
-def _refitted(search: Hypotheses) -> str:
+def _describe_refit(search: Hypotheses) -> str:
     """Say that the simulator was refitted, and with which offsets."""
     return f"refitted with {search.offsets}" if search.offsets else "refitted"
 
@@ -136,6 +135,7 @@ def _is_noise(search: Hypotheses, quiet: float, explained: bool, mode: float | N
 
 
 def _describe_effects(search: Hypotheses, found: Posterior) -> str:
+    """Name the effects, those with a sure name first."""
     sure, unsure = (
         " and ".join(e.words for e in found.effects if (e.confidence > SURE) is known) for known in (True, False)
     )
@@ -165,10 +165,10 @@ def _describe_vanished(search: Hypotheses, found: Posterior) -> str:
     return f" The simulator's own {' and '.join(gone)} {come}." if gone else ""
 
 
-def _which_laws(search: Hypotheses) -> str:
+def _name_tried_laws(search: Hypotheses) -> str:
     """Name the laws that do not explain the mismatch; after the time limit, only those that were fitted."""
     if not search.out_of_time or search.tried >= search.selected:
-        allowed = _allowed_laws(search)
+        allowed = _list_allowed_laws(search)
         if allowed is None:
             return "no law of the catalogue"
         return f"none of the laws tried ({allowed})" if allowed else "no law (none was allowed)"
@@ -176,75 +176,70 @@ def _which_laws(search: Hypotheses) -> str:
     return f"none of the laws that were fitted before the time limit ({pairs})"
 
 
-def _fails(search: Hypotheses) -> str:
+def _describe_failure(search: Hypotheses) -> str:
     """Say that no law explains the mismatch, or that none was fitted."""
-    if len(search.memo) == 1 and not search.out_of_time and _allowed_laws(search) != "":
+    if len(search.memo) == 1 and not search.out_of_time and _list_allowed_laws(search) != "":
         why = "because all that is left may be noise" if search.most_effects else "as asked for"
         return f"no law was fitted, {why}"
-    return f"{_which_laws(search)} explains it"
+    return f"{_name_tried_laws(search)} explains it"
 
 
-def _allowed_laws(search: Hypotheses) -> str | None:
+def _list_allowed_laws(search: Hypotheses) -> str | None:
     """List the laws that were allowed; None if all of the catalogue were."""
     if {law.__name__ for law in search.laws} >= {law.__name__ for law in CATALOGUE}:
         return None
     return in_words(list(dict.fromkeys(display_name(law.id) for law in search.laws if law.id != "offset")))
 
 
-def _among_laws(search: Hypotheses) -> str:
+def _describe_allowed_laws(search: Hypotheses) -> str:
     """Say which laws were tried, unless the whole catalogue was."""
-    allowed = _allowed_laws(search)
+    allowed = _list_allowed_laws(search)
     if allowed is None:
         return ""
     return f", as far as the laws tried can show ({allowed})" if allowed else ", though no law was allowed"
 
 
-def _explains_all(search: Hypotheses, laws: int) -> str:
+def _describe_partial_failure(search: Hypotheses, laws: int) -> str:
     """Say what failed to explain all of the mismatch; after the time limit, further effects may not have been tried."""
     if search.out_of_time and search.tried >= search.selected:
         effects = "one effect, which does" if laws == 1 else f"{laws} effects, which do"
         return f"the time limit ended the search after {effects} not explain all of it"
-    return f"{_which_laws(search)} explains all of it"
+    return f"{_name_tried_laws(search)} explains all of it"
 
 
-def _describe_unexplained(search: Hypotheses, closest: Trial, shares: dict[str, float], mode: float | None) -> str:
-    root, share = search.root, max(shares.values(), default=0.0)
-    where = max(shares, key=lambda k: shares[k], default="")
-    laws, left = closest.effects, share_left(search, closest.fitted, floor=search.least_floor)
-    if not laws or 1 - left < LEAST_EXPLAINED:
+def _describe_far(search: Hypotheses, share: float, where: str, mode: float | None) -> str:
+    """Describe a mismatch that no law comes near; a force at a port, `where`, explains the `share` of it."""
+    estimated, rings, at = search.floor.source == "estimated", "", ""
+    if mode:
         rings = (
             f" The rest swings at the simulator's own {mode:.3g} Hz, as from a force that was not recorded or a value "
             "that varies in time."
-            if mode
-            else ""
         )
-        at = (
-            f" A force at {where} could explain {100 * share:.0f} % of the rest; it may also be one that was not "
-            "recorded."
-            if share > LEAST_EXPLAINED
-            else ""
-        )
-        noise = search.least_floor.nrmse(search.bench.scale)
-        least = "at least" if search.floor.source == "estimated" else "about"
-        large = (
-            search.floor.source == "estimated"
-            and share < LEAST_EXPLAINED
-            and times_of_noise(search) < WHITE_NOISE_RATIO
-        )
-        or_noise = ", or the noise is large and slow" if large and not mode else ""
-        refitted = _refitted(search).replace("refitted", "Refitted", 1)
-        return (
-            f"Physics is missing{or_noise}, and {_fails(search)}. {refitted}, the simulator is off by "
-            f"{percent(search.bench.nrmse(root.fitted))} of the outputs' deviation; the noise is {least} "
-            f"{percent(noise)}.{at}{rings}"
-        )
+    if share > LEAST_EXPLAINED:
+        explained = f"{100 * share:.0f} % of the rest"
+        at = f" A force at {where} could explain {explained}; it may also be one that was not recorded."
+    large = estimated and share < LEAST_EXPLAINED and times_of_noise(search) < WHITE_NOISE_RATIO
+    or_noise = ", or the noise is large and slow" if large and not mode else ""
+    return (
+        f"Physics is missing{or_noise}, and {_describe_failure(search)}. {capitalise(_describe_refit(search))}, the "
+        f"simulator is off by {percent(search.bench.nrmse(search.root.fitted))} of the outputs' deviation; the noise "
+        f"is {'at least' if estimated else 'about'} {percent(search.least_floor.nrmse(search.bench.scale))}.{at}{rings}"
+    )
+
+
+def _describe_unexplained(search: Hypotheses, closest: Trial, shares: dict[str, float], mode: float | None) -> str:
+    """Describe the likeliest port of an unexplained mismatch, and how much of it the closest laws remove."""
+    share, where = max(shares.values(), default=0.0), max(shares, key=lambda k: shares[k], default="")
+    laws, left = closest.effects, share_left(search, closest.fitted, floor=search.least_floor)
+    if not laws or 1 - left < LEAST_EXPLAINED:
+        return _describe_far(search, share, where, mode)
     # a force at the laws' port explains what they remove, however little of it shows beside the linearised simulator
     there = max(shares.get(laws[0].port, 0.0), 1 - left)
     port = laws[0].port if there >= OTHER_PORT_SHARE * share else where
     # after the time limit, this may not be worth another minute
     looked = search.findings[closest.key].flexible is not None or not search.out_of_time
     rest = max(search.flexible(closest).values(), default=0.0) if looked else 0.0
-    words = " and ".join(name_at(e.port, e.law.id, e.law.form) for e in laws)
+    words = " and ".join(e.words for e in laws)
     named = f"laws, {words}, remove" if laws[1:] else f"law, {words}, removes"
     if left < FORMULA_ERROR:
         them, sure = ("they are", "names are") if laws[1:] else ("it is", "name is")
@@ -257,6 +252,6 @@ def _describe_unexplained(search: Hypotheses, closest: Trial, shares: dict[str, 
     if rest > LEAST_EXPLAINED:
         explained = f": a force at a port explains {100 * rest:.0f} % of it"
     return (
-        f"Physics is missing, most likely at {port}, and {_explains_all(search, len(laws))}. The closest "
+        f"Physics is missing, most likely at {port}, and {_describe_partial_failure(search, len(laws))}. The closest "
         f"{named} {removed} of the mismatch on the training recordings. The rest is not noise{explained}."
     )

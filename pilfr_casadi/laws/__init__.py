@@ -30,6 +30,7 @@ if TYPE_CHECKING:
         POSITION_GAINS as POSITION_GAINS,
         SCALABLE as SCALABLE,
         SMALL_AND_LARGE as SMALL_AND_LARGE,
+        related_forms as related_forms,
     )
     from .composed import (
         Feedthrough as Feedthrough,

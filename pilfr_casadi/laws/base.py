@@ -198,7 +198,7 @@ class Law:
     absent : tuple of domain
         Physical domains in which it cannot occur; there it is not tried.
     sentences : mapping
-        What it is in a physical domain, if `sentence` does not say it there.
+        Description of the law in a physical domain, if `sentence` does not say it there.
     special : bool
         It is tried only at ports of its domains, and not where the domain is unknown.
     across : str
@@ -210,8 +210,6 @@ class Law:
         except those in `signed`.
     flexible : bool
         The law can imitate many others, and is less likely before the data are seen.
-    contains : tuple of str
-        Ids of laws that are special cases of it, for the catalogue in the documentation.
     signed : tuple of str
         Strengths of a dissipative or restoring law that may have either sign.
     two_sided : bool
@@ -290,7 +288,6 @@ class Law:
     restoring: ClassVar[bool] = False
     two_sided: ClassVar[bool] = False
     flexible: ClassVar[bool] = False
-    contains: ClassVar[tuple[str, ...]] = ()
     signed: ClassVar[tuple[str, ...]] = ()
     order: ClassVar[int] = 0
     follows: ClassVar[int] = 0
@@ -386,11 +383,11 @@ class Law:
 
     @classmethod
     def finer_starts(cls, found: Law, local: Local) -> Iterator[dict[str, Any]]:
-        """Start values of this form for a law found in another form, with the means of strengths that vary.
+        """Start values of this form, by name and unit, for a law found in another form; strengths that vary have means.
 
         A form that contains the found law, or its base class, begins where it equals that.
         """
-        own = {name: value for name, value in found.values.items() if name in cls.units}
+        own = {name: value for name, value in found.values.items() if cls.units.get(name) == found.units[name]}
         for name in own:
             ends = [found.values[f"{name}{end}"] for end in ("", "_mid", "_high") if f"{name}{end}" in found.values]
             own[name] = np.mean(ends, axis=0)
@@ -399,11 +396,6 @@ class Law:
         shape = next(cls().shapes(local)) if based else {}
         if shape.keys() - own.keys():  # its further shape may be far from that of the base
             yield shape | own
-
-    @classmethod
-    def shares_values(cls) -> bool:
-        """Tell whether values of another form are start values of this one as they are, as in most laws."""
-        return cls.finer_starts.__func__ is Law.finer_starts.__func__  # type: ignore[attr-defined]
 
     @classmethod
     def extends(cls, found: type[Law]) -> bool:

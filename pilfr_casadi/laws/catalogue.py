@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 from . import curves, dynamic, electrical, friction, hysteresis, in_line, stiffness, thermal
@@ -15,6 +16,26 @@ FINER: dict[type[Law], tuple[Any, ...]] = {
     hysteresis.GeneralizedHysteresis: (hysteresis.FineGeneralized,),
     curves.FreeCurve: (curves.SteepCurve,),
 }
+
+
+def related_forms(found: type[Law], laws: Iterable[type[Law]]) -> dict[type[Law], str]:
+    """Return the forms that are fitted from the values of a law that was found, and how they are related to it.
+
+    "finer": the form contains the law. "plainer": the law contains the form, and its values are values of the form as
+    they are. "other": neither.
+    """
+
+    def relation(kind: Any) -> str:
+        if kind in finest or kind.extends(found):
+            return "finer" if issubclass(kind, found) else "other"
+        keeps_values = kind.finer_starts.__func__ is Law.finer_starts.__func__  # type: ignore[attr-defined]
+        return "plainer" if kind is base and base.units.items() <= found.units.items() and keeps_values else ""
+
+    base: Any = found.__base__
+    finest = FINER.get(found, ())
+    related = {kind: relation(kind) for kind in (*finest, *laws)}
+    return {kind: name for kind, name in related.items() if name}
+
 
 # laws in the order in which they are tried: file by file, in the order of their definitions
 CATALOGUE: tuple[type[Law], ...] = (

@@ -81,7 +81,6 @@ class Relaxation(Law):
     """Creep of a support or material: a spring and a damper in series, in parallel to the rest (Maxwell 1867)."""
 
     id = "creep"
-    contains = ("linear_stiffness", "viscous_damping")
     equation = "w = k_v (z - q),  dq/dt = (z - q) / T"
     source = "Findley, Lai & Onaran (1976), Creep and Relaxation, ch. 5"
     sentence = "creep: under a constant load the deflection goes on slowly"
@@ -176,7 +175,6 @@ class Lag(Law):
 
     id = "extra_mode"
     flexible = True
-    contains = ("linear_stiffness", "viscous_damping")
     form = "lag"
     equation = "w = q - u,  dq/dt = (u - q) / T"
     source = "Franklin, Powell & Emami-Naeini (2015), sec. 3.3"
@@ -200,7 +198,6 @@ class Resonance(Law):
 
     id = "extra_mode"
     flexible = True
-    contains = ("linear_stiffness", "viscous_damping")
     form = "resonance"
     equation = "w = q_1 - u,  d2q_1/dt2 = W^2 (u - q_1) - 2 D W dq_1/dt"
     source = "Franklin, Powell & Emami-Naeini (2015), sec. 3.3"

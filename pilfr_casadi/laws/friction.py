@@ -115,7 +115,6 @@ class StribeckFriction(CoulombFriction):
 
     id = "stribeck_friction"
     flexible = True
-    contains = ("coulomb_friction",)
     form = ""
     equation = "w = (F_c + F_e exp(-(dz/dt / v_s)^2)) tanh(dz/dt / v_0)"
     sentence = "dry friction that is larger at rest than in motion"
@@ -148,7 +147,6 @@ class PreslidingStribeckFriction(PreslidingFriction):
 
     id = "stribeck_friction"
     flexible = True
-    contains = ("coulomb_friction",)
     equation = "w = (k_t + k_e exp(-(dz/dt / v_s)^2)) stop_r[z],  F_c = k_t r"
     source = "Armstrong-Hélouvry, Dupont & Canudas de Wit (1994), Automatica 30(7); Jenkins (1962)"
     sentence = "dry friction that is larger at rest than in motion, and whose contact springs back before it slides"

@@ -41,7 +41,6 @@ class _Hysteresis(Law):
 
     id = "hysteresis"
     flexible = True
-    contains = ("backlash", "coulomb_friction", "linear_stiffness")
     sentence = "rate-independent hysteresis: a force that depends on where the motion last turned round"
     turns = True
     dissipative = True

@@ -167,7 +167,6 @@ class PiecewiseStiffness(Law):
     """A contact: another spring acts beyond a point (Shaw & Holmes 1983)."""
 
     id = "piecewise_stiffness"
-    contains = ("linear_stiffness",)
     form = "above"
     equation = "w = k_c max(z - g, 0)"
     source = "Shaw & Holmes (1983), J. Sound Vib. 90(1)"
@@ -274,7 +273,6 @@ class Clearance(Law):
     """A gap spring: force only beyond the clearance on either side (Shaw & Holmes 1983)."""
 
     id = "clearance"
-    contains = ("piecewise_stiffness", "linear_stiffness")
     form = "symmetric"
     equation = "w = k_g (z - clip(z, -g, g))"
     source = "Shaw & Holmes (1983), J. Sound Vib. 90(1)"

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from .._base import with_nan
 from ..data import COURSES, Recording
 from ..diagnose import Diagnosis
 from ..identify import Comparison, Fit
@@ -90,7 +91,7 @@ def simulator_card(simulator: Simulator) -> str:
         "ports": ", ".join(p.name for p in s.ports) or "one for each state equation",
     }
     if s.elements:
-        properties["laws in ports"] = ", ".join(name_at(e.port, e.law.id, e.law.form) for e in s.elements)
+        properties["laws in ports"] = ", ".join(e.words for e in s.elements)
     title = "Simulator in discrete time" if s.discrete else "Simulator"
     return Card(title, facts=properties, tables=_parameter_tables(s.readable_parameters(), {})).html()
 
@@ -135,8 +136,7 @@ def diagnosis_card(diagnosis: Diagnosis) -> str:
     for e in diagnosis.effects:
         values = []
         for name, p in e.parameters.items():
-            std = np.nan if p["std"] is None else float(p["std"])
-            values.append(f"{name} = {uncertain_text(p['value'], std)} {p['unit']}".strip())
+            values.append(f"{name} = {uncertain_text(p['value'], with_nan(p['std']))} {p['unit']}".strip())
         varies = kind_of(e.port) == PARAMETER
         law = name_at(e.port, e.law, e.form) if varies else display_name(e.form or e.law)
         rows.append([law, e.port, f"{e.confidence:.2f}", ", ".join(values)])

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from .. import identify, laws, simulators
-from .._base import percent, to_json, with_nan
+from .._base import capitalise, percent, to_json, with_nan
 from ..data import DIVERGING
 from ..diagnose import ERROR_NAMES, Diagnosis, Effect, Fitted, Workbench, law_signals, learned_force
 from ..laws import (
@@ -121,7 +121,7 @@ def answer(diagnosis: Diagnosis, forces: Sequence[str]) -> str:
     gain = ", ".join(f"{percent_text(errors.get(k))} {name}" for k, name in steps.items())
     worse = ", which is worse" if d.outcome == "worse" else ""
     data = "unseen data" if role == "test" else "the training data"
-    return f"{words[0].upper()}{words[1:]}; error on {data} {gain}{worse}"
+    return f"{capitalise(words)}; error on {data} {gain}{worse}"
 
 
 def headline(diagnosis: Diagnosis) -> str:
@@ -179,21 +179,19 @@ def effect_blocks(diagnosis: Diagnosis, number: int, action: Table | None) -> li
     e = diagnosis.effects[number]
     name = name_at(e.port, e.law, e.form)
     out: list[Block] = [
-        Text(f"{name[0].upper()}{name[1:]}. In words: {e.sentence}. Confidence {e.confidence:.2f} of 1{e.place}."),
+        Text(f"{capitalise(name)}. In words: {e.sentence}. Confidence {e.confidence:.2f} of 1{e.place}."),
         Code(e.equation),
     ]
     if action:
         out.append(action)
     if worth := diagnosis.worth(e):
-        out.append(Text(f"{worth[0].upper()}{worth[1:]}."))
-    rows = [
-        [name, uncertain_text(p["value"], with_nan(p["std"])) + e.limit(name), p["unit"] or "–"]
+        out.append(Text(f"{capitalise(worth)}."))
+    values = {
+        name: (uncertain_text(p["value"], with_nan(p["std"])) + e.limit(name), p["unit"])
         for name, p in (e.defined | e.parameters).items()
-    ]
-    if rows:
-        given = any(np.isfinite(with_nan(p["std"])) for p in e.parameters.values())
-        note = "± one standard deviation." if given else ""
-        out.append(Table(["parameter", "value", "unit"], rows, note=note))
+    }
+    given = any(np.isfinite(with_nan(p["std"])) for p in e.parameters.values())
+    out += _value_table(values, "± one standard deviation." if given else "")
     if e.indistinguishable:
         others = "; ".join(name_at(port, law) for port, law in e.indistinguishable)
         out.append(Text(f"These recordings cannot tell it apart from: {others}."))
@@ -209,12 +207,18 @@ def nameless_blocks(diagnosis: Diagnosis) -> list[Block]:
     """Describe the laws of a correction without a sure name: equations, values, and the laws that explain as much."""
     out = list[Block]()
     for law in diagnosis.nameless_laws:
-        out += [Text(f"{law.name[0].upper()}{law.name[1:]}:"), Code(law.equation)]
-        rows = [[name, value, unit or "–"] for name, (value, unit) in law.values.items()]
-        out += [Table(["parameter", "value", "unit"], rows)] if rows else []
-        out += [Text(f"{law.doubt[0].upper()}{law.doubt[1:]}.")] if law.doubt else []
+        out += [Text(f"{capitalise(law.name)}:"), Code(law.equation)]
+        values = {name: (", ".join(map(number_text, np.ravel(p.value))), p.unit) for name, p in law.free.items()}
+        out += _value_table(values)
+        out += [Text(f"{capitalise(law.doubt)}.")] if law.doubt else []
         out += [Text(f"These recordings cannot tell it apart from {law.alike}.")] if law.alike else []
     return out
+
+
+def _value_table(values: Mapping[str, tuple[str, str]], note: str = "") -> list[Block]:
+    """Tabulate values with their units, by name; no table if there are none."""
+    rows = [[name, value, unit or "–"] for name, (value, unit) in values.items()]
+    return [Table(["parameter", "value", "unit"], rows, note=note)] if rows else []
 
 
 def candidates_by_pass(diagnosis: Diagnosis) -> list[tuple[list[dict[str, Any]], Any]]:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from .. import plots
-from .._base import make_folder, multiple, write_atomically
+from .._base import capitalise, make_folder, multiple, write_atomically
 from ..data import DIVERGING, Recording, as_recordings, rmse_per_output
 from ..identify import Fit
 from ..linear import LinearPart, any_bla
@@ -145,27 +145,31 @@ def _error_table(rows: list[dict[str, Any]]) -> Table:
 def _verdict(judged: list[dict[str, Any]]) -> str:
     """Write a sentence on the largest error of an output, and the error of a linear model there."""
     kind = "on test recordings" if judged[0]["role"] == "test" else "on its training recordings"
-    worst = max(judged, key=lambda r: r["nrmse"])
+    worst, error, linear = _worst(judged)
     several_outputs = len({r["output"] for r in judged}) > 1
     place = f"{worst['output']} in {worst['recording']}" if several_outputs else worst["recording"]
     text = f"Simulated from its inputs alone, {kind}, the model"
-    if not worst["nrmse"] < DIVERGING:
+    if not error:
         return f"{text} diverges ({place})." if len(judged) > 1 else f"{text} diverges."
-    text += f" is off by {100 * worst['nrmse']:.2g}\u00a0% of the output's standard deviation"
-    text += f" at worst ({place})" if len(judged) > 1 else ""
-    if np.isfinite(worst["linear"]):
-        text += f"; a linear model of the same order by {100 * worst['linear']:.2g}\u00a0%"
-    return f"{text}."
+    where = f" at worst ({place})" if len(judged) > 1 else ""
+    beside = f"; a linear model of the same order by {linear}" if linear else ""
+    return f"{text} is off by {error} of the output's standard deviation{where}{beside}."
 
 
 def _answer(judged: list[dict[str, Any]]) -> str:
     """Write the headline: the largest error of an output, and the error of a linear model there."""
     where = "unseen data" if judged[0]["role"] == "test" else "the training data; no other data was given"
-    worst = max(judged, key=lambda r: r["nrmse"])
-    if not worst["nrmse"] < DIVERGING:
+    _, error, linear = _worst(judged)
+    if not error:
         return f"The model diverges on {where}"
-    linear = f"; a linear model {100 * worst['linear']:.2g}\u00a0%" if np.isfinite(worst["linear"]) else ""
-    return f"{100 * worst['nrmse']:.2g}\u00a0% error on {where}{linear}"
+    return f"{error} error on {where}" + (f"; a linear model {linear}" if linear else "")
+
+
+def _worst(judged: list[dict[str, Any]]) -> tuple[dict[str, Any], str, str]:
+    """Return the row with the largest error, that error, and the linear model's; empty if it diverges or is unknown."""
+    worst = max(judged, key=lambda r: r["nrmse"])
+    error, linear = (f"{100 * worst[k]:.2g}\u00a0%" for k in ("nrmse", "linear"))
+    return worst, error if worst["nrmse"] < DIVERGING else "", linear if np.isfinite(worst["linear"]) else ""
 
 
 def _tone(status: Status, judged: list[dict[str, Any]]) -> str:
@@ -207,7 +211,7 @@ def _subtitle(fit: Fit) -> str:
 
 def _search(fit: Fit) -> list[Block]:
     lines = [line.rstrip(".") for line in str(fit).splitlines()[1:] if line]
-    out: list[Block] = [Text(". ".join(line[0].upper() + line[1:] for line in lines) + ".")]
+    out: list[Block] = [Text(". ".join(map(capitalise, lines)) + ".")]
     if fit.solution.history or any(c.solution.history for c in fit.candidates):
         caption = "Training error over iterations: every start, and the last solve of the best one."
         out.append(Picture(plots.convergence(fit), caption, "Convergence of the starts."))

@@ -234,6 +234,11 @@ class Placed:
         """Port and id of the law, which are alike for all its forms."""
         return self.port, self.law.id
 
+    @property
+    def words(self) -> str:
+        """Law, form and port in words; see `name_at`."""
+        return name_at(*self.name, self.law.form)
+
     def own(self, values: Mapping[str, Any]) -> dict[str, Any]:
         """Select the law's values, by its own names, from values by full name."""
         return {name: values[f"{self.prefix}{name}"] for name in self.law.parameters()}

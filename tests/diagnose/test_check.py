@@ -13,8 +13,8 @@ from diagnosis_example import recorded, rig as spring_rig
 import pilfr_casadi as pilfr
 from pilfr_casadi import InputError, Parameter, Port, Recording, Simulator, check, multisine
 from pilfr_casadi.diagnose.excitation import single_frequency
-from pilfr_casadi.diagnose.extrapolation import ranges_left, share_at_new_frequencies
 from pilfr_casadi.diagnose.identifiability import Tie
+from pilfr_casadi.diagnose.proof import ranges_left, share_at_new_frequencies
 from pilfr_casadi.laws import CATALOGUE, CoulombFriction, CubicDamping, CubicStiffness, Root
 from pilfr_casadi.models import close_loop
 from problems.blind_spots import DT, NOISE, SAMPLES, controls, noise_like, plain, record, rigs

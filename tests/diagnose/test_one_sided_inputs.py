@@ -8,7 +8,7 @@ import pytest
 import pilfr_casadi as pilfr
 from pilfr_casadi import Parameter, Recording, Simulator
 from pilfr_casadi.diagnose.faults.samples import find_clipped_input, find_clipping
-from pilfr_casadi.diagnose.pipeline import _conclude_without_a_law, _Judged
+from pilfr_casadi.diagnose.pipeline import _conclude_without_a_law, _Judgement
 from pilfr_casadi.diagnose.posterior import posterior
 from pilfr_casadi.diagnose.preparation import prepare
 from pilfr_casadi.laws import CubicStiffness
@@ -96,7 +96,7 @@ def test_an_input_at_its_limits_is_no_fault_where_a_law_without_a_name_leaves_le
     )
     assert d.verdict == "recording-fault"
     search = d.evidence.search
-    judged = _Judged.of(search, replace(posterior(search), effects=()), ())
+    judged = _Judgement.of(search, replace(posterior(search), effects=()), ())
     assert judged.kind == "unexplained" and _conclude_without_a_law(search, judged).verdict.kind == "recording-fault"
     law = next(t for t in search.memo.values() if t.laws)
     search.memo[law.key] = replace(law, mean_square=1e-3 * law.mean_square)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from pilfr_casadi.diagnose.faults.offsets import Offset
-from pilfr_casadi.diagnose.fits.evidence import STRAINED_ODDS, HeldOut, significance
-from pilfr_casadi.diagnose.posterior import explainable_remainder, posterior, share_named
+from pilfr_casadi.diagnose.fits.evidence import FORMULA_ERROR, STRAINED_ODDS, HeldOut, formula_tolerance, significance
+from pilfr_casadi.diagnose.posterior import explainable_remainder, posterior, share_left, share_named
 from pilfr_casadi.diagnose.verdict import closest_hypothesis, judge
 from pilfr_casadi.laws import CoulombFriction, CubicStiffness, Delay, DirectionalFriction, QuadraticDrag
 
@@ -92,6 +92,22 @@ def test_what_formulas_may_leave_asks_for_no_further_law(search, trial, left, mo
     """The formula of a law may leave a thousandth of the mismatch; the quiet one of two sensors shows even that."""
     one = trial(DRY, left=left)
     assert search(one).can_improve(one) == more
+
+
+@pytest.mark.parametrize("error", [1.0, 20.0])
+def test_a_simulator_that_runs_away_excuses_no_error(search, trial, hypothesis, error):
+    """Whether the refit is off by the outputs' deviation or by twenty times that, a law may leave as much."""
+    one = trial(DRY, left=1e-2)
+    found = search(one)
+    found.memo[frozenset()] = hypothesis(error=error)
+    noise2 = found.floor2
+    assert found.tolerance == pytest.approx(FORMULA_ERROR * (1 - noise2), rel=1e-6)
+    assert share_left(found, one.fitted) == pytest.approx((1e-2 - noise2) / (1 - noise2), rel=1e-6)
+
+
+def test_each_output_excuses_an_error_up_to_its_own_deviation():
+    assert formula_tolerance(np.array([0.5]), np.array([0.1])) == pytest.approx(0.4 * FORMULA_ERROR)
+    assert formula_tolerance(np.array([400.0, 0.5]), np.zeros(2)) == pytest.approx(0.75 * FORMULA_ERROR)
 
 
 def test_an_effect_keeps_its_name_only_in_the_corrected_simulator(search, trial):

@@ -152,8 +152,8 @@ def test_laws_stay_if_the_time_ends_in_the_search_with_a_shorter_memory(monkeypa
         repeated.append(search)
         return again(first, partial(search.func, replace(search.args[0], deadline=0.0)))
 
-    again = repetitions._again
-    monkeypatch.setattr(repetitions, "_again", without_time)
+    again = repetitions._repeat
+    monkeypatch.setattr(repetitions, "_repeat", without_time)
     laws = (Gain, CoulombFriction)
     found = pilfr.diagnose(cart(), pushed(0.4, 0.02, 2e-3), laws=laws, focus="prediction", workers=1)
     assert repeated and [(e.port, e.law) for e in found.effects] == [("rails", "coulomb_friction")]

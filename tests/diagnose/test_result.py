@@ -15,8 +15,9 @@ import pilfr_casadi as pilfr
 from pilfr_casadi import InputError
 from pilfr_casadi.data import nrmse
 from pilfr_casadi.diagnose import BlindSpot, Effect, Workbench
+from pilfr_casadi.diagnose.experiment import next_experiment
 from pilfr_casadi.diagnose.faults.offsets import Offset
-from pilfr_casadi.diagnose.proof import Started, compare_errors, next_experiment
+from pilfr_casadi.diagnose.proof import Started, compare_errors
 from pilfr_casadi.engine import make_engine
 from pilfr_casadi.identify import run_free
 from pilfr_casadi.laws import Backlash, CoulombFriction, CubicDamping, CubicStiffness, StopHysteresis
@@ -286,7 +287,7 @@ def test_the_next_experiment_has_a_unit_that_the_simulator_knows():
     bench = Workbench.of(known, [r.with_(units={})], "zero")
     stiffening = known.with_element("ground", CubicStiffness().at({"k_3": 2.0e4}))
     both = [bench.run(s, {k: p.value for k, p in s.parameters.items()}, [np.zeros(2)]) for s in (known, stiffening)]
-    found = next_experiment(bench, *both, noise=1e-3 * bench.scale)
+    found = next_experiment(bench, both, noise=1e-3 * bench.scale)
     assert " N at force separates the two best" in found["sentence"]
 
 
@@ -297,7 +298,7 @@ def test_the_next_experiment_says_where_the_machine_would_leave_its_recorded_ran
     bench = Workbench.of(free, [r.with_(units={"pos": "mm"})], "zero")
     dragged = free.with_element("ground", CubicDamping().at({"c_3": 1.0}))
     both = [bench.run(s, {k: p.value for k, p in s.parameters.items()}, [np.zeros(2)]) for s in (free, dragged)]
-    said = next_experiment(bench, *both, noise=1e-3 * bench.scale)["sentence"]
+    said = next_experiment(bench, both, noise=1e-3 * bench.scale)["sentence"]
     assert re.search(
         r"By the simulation pos would vary over [^ ]+ mm; in these recordings it varies over [^ ]+ mm\.$", said
     )
@@ -310,7 +311,7 @@ def test_the_next_experiment_stays_within_the_recorded_range():
     bench = Workbench.of(rig(), [pushed], "zero")
     stiffening = rig().with_element("ground", CubicStiffness().at({"k_3": 2.0e4}))
     both = [bench.run(s, {k: p.value for k, p in s.parameters.items()}, [np.zeros(2)]) for s in (rig(), stiffening)]
-    found = next_experiment(bench, *both, noise=1e-3 * bench.scale)
+    found = next_experiment(bench, both, noise=1e-3 * bench.scale)
     assert found["level"] - found["amplitude"] > -1e-9 * np.ptp(pushed.u)
     assert found["level"] + found["amplitude"] < np.max(pushed.u) * (1 + 1e-9)
     assert f"about {found['level']:.3g}" in found["sentence"]

@@ -23,8 +23,10 @@ from pilfr_casadi.laws import (
     Delay,
     ElasticDrive,
     GeneralizedHysteresis,
+    HertzContact,
     Local,
     Mode,
+    PiecewiseStiffness,
     PreslidingStribeckFriction,
     Relaxation,
     StopHysteresis,
@@ -524,6 +526,12 @@ def test_a_form_that_contains_its_base_equals_it_where_it_starts(kind):
     np.testing.assert_allclose(form, unit_forces(plain, local, [shape])[:, 0], atol=1e-9)
     assert set(start) == set(kind.units) and all(start[name] == 1.0 for name in kind.strength)
     assert kind.extends(type(plain)) and not kind.extends(kind)
+
+
+def test_a_value_of_another_unit_is_no_start_value():
+    """The strengths of a contact in a line and of one between curved bodies have one name."""
+    line = PiecewiseStiffness().at({"k_c": 600.0, "g": 0.02})
+    assert next(HertzContact.finer_starts(line, LOCAL)) == {"g": 0.02}
 
 
 def test_only_the_class_itself_knows_its_base():

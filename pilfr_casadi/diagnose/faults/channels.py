@@ -119,7 +119,7 @@ def find_gross_channel_errors(bench: Workbench, workers: int = 1) -> list[Gate]:
     The run at these values has to be off by more than its own size, and with the channel corrected by less.
     """
     given = Checked(bench, bench.run_given())
-    before = _unfollowed(bench, given.fitted.residual)
+    before = _relative_error(bench, given.fitted.residual)
     if not before > 1:
         return []
     faults = _possible_channel_errors(given, given.fitted.residual, trust_values=True)
@@ -137,7 +137,7 @@ def correct_gross_channel_errors(bench: Workbench) -> Checked | None:
 
 
 def _run_corrected(given: Checked, fault: Gate) -> float:
-    """Return what a run at the given values does not follow once a fault is corrected; see `_unfollowed`.
+    """Return what a run at the given values does not follow once a fault is corrected; see `_relative_error`.
 
     It is infinite after the bench's deadline.
     """
@@ -146,11 +146,11 @@ def _run_corrected(given: Checked, fault: Gate) -> float:
     bench, now = fault.apply(given.bench), given.fitted
     pairs = list(zip(given.bench.recordings, bench.recordings, strict=True))
     if now.simulator.observer is not None or any(not np.array_equal(was.u, r.u) for was, r in pairs):
-        return _unfollowed(bench, bench.run_given(now).residual)
-    return _unfollowed(bench, [e + was.y - r.y for e, (was, r) in zip(now.residual, pairs, strict=True)])
+        return _relative_error(bench, bench.run_given(now).residual)
+    return _relative_error(bench, [e + was.y - r.y for e, (was, r) in zip(now.residual, pairs, strict=True)])
 
 
-def _unfollowed(bench: Workbench, residual: Sequence[np.ndarray]) -> float:
+def _relative_error(bench: Workbench, residual: Sequence[np.ndarray]) -> float:
     """Compute the outputs' mean square error, apart from levels, over the product of simulated and measured deviation.
 
     So an output that is simulated much too small counts as one that is simulated much too large. An output that stands
@@ -179,9 +179,9 @@ def find_channel_errors(now: Checked, workers: int) -> Checked:
         level = correct(now, offset, [{}, now.fitted.values], now.fitted.begin)
         if level is None:
             continue
-        near = _near(level, level.fitted.residual, level.cost <= 1)
+        near = _make_size_test(level, level.fitted.residual, level.cost <= 1)
         unit = bench.simulator.units.get(name, "")
-        factors = [f for f in (-1.0, *_mistakes(unit, UNITS | FAHRENHEIT)) if f < 0 or near("y", [i], f)]
+        factors = [f for f in (-1.0, *_list_factors(unit, UNITS | FAHRENHEIT)) if f < 0 or near("y", [i], f)]
         faults = [scale_channels("y", bench.simulator.output_names, [i], f, " and an offset") for f in factors]
         beside = accept_best(level, faults, workers)
         if beside.adds_to(now) and beside.cost < CURED_SHARE * found.cost:
@@ -201,16 +201,16 @@ def _possible_channel_errors(now: Checked, errors: Sequence[np.ndarray], trust_v
 
     With `trust_values` the sizes count however large the errors are, and the unit of time counts as right.
     """
-    near, faults = _near(now, errors, trust_values or now.cost <= 1), list[Gate]()
+    near, faults = _make_size_test(now, errors, trust_values or now.cost <= 1), list[Gate]()
     channels = {"y": now.bench.simulator.output_names, "u": now.bench.simulator.inputs}
     known = now.bench.simulator.units
     for kind, names in channels.items():
         for i in range(len(names)):
-            factors = [f for f in _mistakes(known.get(names[i], "")) if near(kind, [i], f)]
+            factors = [f for f in _list_factors(known.get(names[i], "")) if near(kind, [i], f)]
             faults += [scale_channels(kind, names, [i], f) for f in (-1.0, *factors)]
     every = range(len(channels["y"]))
     units = [known.get(name, "") for name in channels["y"]]
-    shared = [f for f in _mistakes("") if len(every) > 1 and all(f in _mistakes(unit) for unit in units)]
+    shared = [f for f in _list_factors("") if len(every) > 1 and all(f in _list_factors(unit) for unit in units)]
     joint = [f for f in shared if near("y", every, f)]
     faults += [scale_channels("y", channels["y"], every, f) for f in joint]
     for kind, names in channels.items():
@@ -221,14 +221,16 @@ def _possible_channel_errors(now: Checked, errors: Sequence[np.ndarray], trust_v
     return [*faults, *(map(scale_time, TIME_UNITS) if now.cost > POOR_FIT else ())]
 
 
-def _mistakes(unit: str, units: Mapping[float, Sequence[str]] = UNITS) -> list[float]:
+def _list_factors(unit: str, units: Mapping[float, Sequence[str]] = UNITS) -> list[float]:
     """List factors by which a quantity is off in a wrong unit, of those that fit its own unit, if that is known."""
     own = dimension(unit)
     fitting = [f for f, of in units.items() if own is None or not of or own in map(dimension, of)]
     return [one for factor in fitting for one in (factor, 1 / factor)]  # mistaken in either direction
 
 
-def _near(now: Checked, errors: Sequence[np.ndarray], sized: bool) -> Callable[[str, Sequence[int], float], bool]:
+def _make_size_test(
+    now: Checked, errors: Sequence[np.ndarray], sized: bool
+) -> Callable[[str, Sequence[int], float], bool]:
     """Return a test whether a factor on channels lets the outputs of a run have about the measured size.
 
     Unless `sized`, every factor is allowed: the size of a diverging run says nothing.

@@ -53,9 +53,9 @@ class Gate:
     Attributes
     ----------
     value : object
-        What is wrong, as reported; the start value until the edit is settled.
+        Size or kind of the fault, as reported; the start value until the edit is settled.
     sentence : str
-        What is wrong; `accept` adds the effect of the correction.
+        The finding in words; `accept` adds the effect of the correction.
     corrected : bool
         Whether the diagnosis goes on with the corrected recordings.
     fault : bool
@@ -161,7 +161,7 @@ class Checked:
     def weighted(self, floor: Floor | None = None) -> Checked:
         """Weigh the outputs by their noise, by default the present one, and refit if that changes their weights.
 
-        What formulas may leave of the mismatch counts as noise.
+        The share of the mismatch that formulas may leave counts as noise.
         """
         bench, squares = self.bench, self.fitted.squares
         noise2 = (floor or self.floor).squares(bench.scale)

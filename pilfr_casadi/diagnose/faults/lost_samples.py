@@ -314,7 +314,7 @@ def find_output_gaps(now: Checked) -> Checked:
     settled = None if found is None else settle(now, found, THOROUGH)
     if settled is None:
         return now
-    gap, after = _place(now, *settled)
+    gap, after = _refine_place(now, *settled)
     if after.cost > NEAR_NOISE_RATIO**2 * now.noise2:
         return now
     i, k, lost = gap.value
@@ -335,7 +335,7 @@ def find_output_gaps(now: Checked) -> Checked:
     return accept(now, after, replace(gap, sentence=words))
 
 
-def _place(now: Checked, gap: OutputGap, after: Checked) -> tuple[OutputGap, Checked]:
+def _refine_place(now: Checked, gap: OutputGap, after: Checked) -> tuple[OutputGap, Checked]:
     """Move a gap in ever smaller steps to the best refit, because lost inputs also leave a wrong state before it."""
     step = LARGEST_SHIFT if after.cost > NEAR_NOISE_RATIO**2 * now.noise2 else 0
     while step:

@@ -208,7 +208,9 @@ def find_offsets(now: Checked, otherwise: Mapping[str, str] | None = None) -> Ch
         if largest < EXCEPTION_SHARE:
             break
         alike = [name for name in share if np.isclose(share[name], largest)]  # as at an input and an output behind it
-        settled = {name: found for name in alike if (found := _with_constant(now, name)) is not None}
+        start = [now.fitted.values], now.fitted.initial
+        tried = {name: correct(now, describe_constant(name), *start, THOROUGH) for name in alike}
+        settled = {name: found for name, found in tried.items() if found is not None}
         port = _choose_constant(settled)
         if not port:
             break
@@ -257,11 +259,6 @@ def _doubt_size(bench: Workbench, port: str, value: float) -> str:
     u = recorded_at(bench.recordings, port)
     larger = abs(value) > np.max(np.abs(u)) and np.ptp(u) > 0
     return f"; that is more than {split_port(port)[1]} ever was, which speaks for a constant load" if larger else ""
-
-
-def _with_constant(now: Checked, port: str) -> Checked | None:
-    """Fit a constant at a port."""
-    return correct(now, describe_constant(port), [now.fitted.values], now.fitted.initial, THOROUGH)
 
 
 def _name_of_constant(after: Checked) -> str:

@@ -102,7 +102,7 @@ def mend(r: Recording) -> Recording:
 def find_glitches(y: np.ndarray, u: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Find single samples far off their neighbours, shape (k,); return them and the output without them.
 
-    Those at a pulse of one of the inputs u (M, n_u), or one sample later, may be the answer to it, and are left.
+    Samples at a pulse of one of the inputs u (M, n_u), or one sample later, may be the answer to it, and stay.
     """
     clean, found = np.array(y), np.zeros(0, dtype=int)
     inputs = [(v, distances(v)) for v in ([] if u is None else u.T)]
@@ -213,8 +213,7 @@ def share_of_repeats(columns: Sequence[np.ndarray]) -> float:
         if np.all(on_steps[same]) and np.mean(on_steps[~same]) < DISTINCT_SHARE:
             return 0.0
     by_chance = float(np.mean(np.abs(np.concatenate(list(map(np.diff, columns))) - step) < 0.5 * step))
-    many = len(np.unique(together)) > DISTINCT_SHARE * len(together)
-    return repeated if many and repeated > max(EXCEPTION_SHARE, CHANCE_FACTOR * by_chance) else 0.0
+    return repeated if _is_fine(together) and repeated > max(EXCEPTION_SHARE, CHANCE_FACTOR * by_chance) else 0.0
 
 
 def _smallest_step(v: np.ndarray) -> float:
@@ -247,7 +246,7 @@ def find_frozen_channels(recordings: Sequence[Recording]) -> list[Gate]:
             columns = [getattr(r, side)[:, i] for r in recordings]
             others = [np.delete(r.u, i, axis=1) if side == "u" else r.u for r in recordings]
             stretches = [_find_frozen(v, u) for v, u in zip(columns, others, strict=True)]
-            if not any(map(len, stretches)) or not _is_fine(columns):
+            if not any(map(len, stretches)) or not _is_fine(np.concatenate(columns)):
                 continue
             k = next(k for k, there in enumerate(stretches) if len(there))
             begin, end = stretches[k][0]
@@ -264,16 +263,15 @@ def find_frozen_channels(recordings: Sequence[Recording]) -> list[Gate]:
     return found
 
 
-def _is_fine(columns: Sequence[np.ndarray]) -> bool:
+def _is_fine(values: np.ndarray) -> bool:
     """Tell whether most samples of a channel have a value of their own."""
-    together = np.concatenate(columns)
-    return len(np.unique(together)) > DISTINCT_SHARE * len(together)
+    return len(np.unique(values)) > DISTINCT_SHARE * len(values)
 
 
 def _find_frozen(v: np.ndarray, u: np.ndarray) -> np.ndarray:
     """Find begin and end (behind it) of the long stretches of one value of a channel that end by its largest step.
 
-    Those count in which one of the inputs u (M, n_u) moves, and which are not at the beginning or at a limit.
+    A stretch counts if one of the inputs u (M, n_u) moves in it, and if it is not at the beginning or at a limit.
     """
     steps, moving = np.abs(np.diff(v)), np.any(np.diff(u, axis=0) != 0, axis=1)
     stretches = [(b, e) for b, e in find_stretches(steps == 0) if e - b > LONGEST_REST and b > 0 and e < len(steps)]
@@ -414,9 +412,9 @@ def find_clipping(recordings: Sequence[Recording], kind: str) -> list[Clipping]:
 
 def _share_at_level(y: np.ndarray) -> float:
     """Compute the share of samples at a level of a quantised signal near its extremes; 0 for a continuous one."""
-    values, counts = np.unique(y, return_counts=True)
-    if len(values) > DISTINCT_SHARE * len(y):
+    if _is_fine(y):
         return 0.0
+    counts = np.unique(y, return_counts=True)[1]
     return float(np.median(np.concatenate([counts[1:6], counts[-6:-1]])) / len(y))
 
 

@@ -123,14 +123,18 @@ class EffectiveSamples:
         return WRONG_MODEL_SAMPLES * self.count / (WRONG_MODEL_SAMPLES + wrong * self.count)
 
 
-def formula_tolerance(mismatch2: np.ndarray | float, noise2: np.ndarray | float) -> float:
+def cap_mismatch(mismatch2: np.ndarray) -> np.ndarray:
+    """Limit the mean squares of a mismatch (n_y,) to the outputs' variance: a free run can be off by any factor."""
+    return np.minimum(mismatch2, 1.0)
+
+
+def formula_tolerance(mismatch2: np.ndarray, noise2: np.ndarray) -> float:
     """Compute the mean square error that any law may leave: no machine follows a formula exactly.
 
-    `mismatch2` and `noise2` are mean squares of the refit's residual and of the noise, in units of the outputs'
-    variance, of each output or pooled. A residual above the outputs' deviation counts as that: a simulator can be wrong
-    by any factor.
+    `mismatch2` and `noise2` are mean squares of the refit's residual and of the noise, (n_y,), in units of the outputs'
+    variance.
     """
-    return FORMULA_ERROR * max(float(np.mean(np.minimum(mismatch2, 1.0) - noise2)), 0.0)
+    return FORMULA_ERROR * max(float(np.mean(cap_mismatch(mismatch2) - noise2)), 0.0)
 
 
 def all_sure(confidences: Iterable[float]) -> bool:
@@ -194,9 +198,9 @@ def spread(bench: Workbench, fitted: Fitted, laws: Sequence[Placed], v: float, n
     if not np.any(fitted.model.parameters.free):
         return 0.0
     problem, _, recorded = _hessian(bench, fitted)
-    mean = np.mean(np.concatenate([r.u for r in bench.recordings]), axis=0)
+    mean = np.mean(bench.stacked_inputs, axis=0)
     smaller = [r.with_(u=mean + INPUT_FACTOR * (r.u - mean)) for r in bench.recordings]
-    there, begun = bench.on(smaller), _begun_like(bench, fitted)
+    there, begun = bench.on(smaller), _shrink_initial_states(bench, fitted)
     *_, other = _hessian(there, begun)
     free = int(problem.free.sum())
     if not (np.all(np.isfinite(recorded)) and np.all(np.isfinite(other))):
@@ -225,7 +229,7 @@ def spread(bench: Workbench, fitted: Fitted, laws: Sequence[Placed], v: float, n
     return found / max(now / as_recorded, 1.0) if 0 < as_recorded < np.inf and now < np.inf else found
 
 
-def _begun_like(bench: Workbench, fitted: Fitted) -> Fitted:
+def _shrink_initial_states(bench: Workbench, fitted: Fitted) -> Fitted:
     """Return a fit whose estimated initial states are nearer to each run's mean state by INPUT_FACTOR.
 
     With the recorded state, a motion that inputs and state cancel as recorded, such as a hardly damped vibration, would
@@ -255,7 +259,7 @@ def runs_away(bench: Workbench, fitted: Fitted, refitted: Fitted) -> bool:
     if bench.simulator.observer is not None:
         return False
     k = int(np.argmax([len(r) for r in bench.recordings]))
-    r, inputs = bench.recordings[k], np.concatenate([r.u for r in bench.recordings])
+    r, inputs = bench.recordings[k], bench.stacked_inputs
     rest, ends = np.mean(inputs, axis=0), (np.min(inputs, axis=0), np.max(inputs, axis=0))
 
     def reach(one: Fitted, u: np.ndarray) -> tuple[float, float]:
@@ -275,7 +279,7 @@ def runs_away(bench: Workbench, fitted: Fitted, refitted: Fitted) -> bool:
 
 def _amplification(bench: Workbench, fitted: Fitted) -> float:
     """Compute the mean square change of the outputs by a small perturbation, over that of the inputs."""
-    rng, size = np.random.default_rng(0), PERTURBATION * np.std(np.concatenate([r.u for r in bench.recordings]), axis=0)
+    rng, size = np.random.default_rng(0), PERTURBATION * np.std(bench.stacked_inputs, axis=0)
     perturbed = bench.on([r.with_(u=r.u + size * rng.standard_normal(r.u.shape)) for r in bench.recordings])
     try:
         with np.errstate(all="ignore"):

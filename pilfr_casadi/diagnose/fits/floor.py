@@ -1,6 +1,6 @@
 """The noise floor: from repeated periods, from repeated recordings, or estimated from a residual.
 
-What repeats is rounded alike, so that a measured floor is at least the error of rounding to the sensor's steps. A
+Repeats are rounded alike, so that a measured floor is at least the error of rounding to the sensor's steps. A
 machine that wears, warms up or is set otherwise does not repeat: then the input drives the differences between the
 repeats, which are no noise.
 

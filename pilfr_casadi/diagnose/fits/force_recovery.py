@@ -22,7 +22,6 @@ import numpy as np
 from ..._base import one_at_a_time
 from ...data import COURSES, Recording
 from ...linear import measurement_update
-from ...models import Model
 from ...simulators import (
     ACTUATOR,
     PARAMETER,
@@ -41,7 +40,15 @@ from ...simulators import (
     states_along,
 )
 from .evidence import FORMULA_ERROR
-from .linearise import ProbeForce, compose_substeps, input_slope, local_signals, loudest_stretch, simulate_states
+from .linearise import (
+    ProbeForce,
+    compose_substeps,
+    differentiate_step,
+    input_slope,
+    local_signals,
+    loudest_stretch,
+    simulate_states,
+)
 from .workbench import Fitted, Workbench, pack_known
 
 NOISE_FACTORS = (1.0, 3.0, 9.0)  # factors on the given noise that are tried
@@ -349,7 +356,7 @@ def _recover(
     values = {k: v for k, v in fitted.values.items() if k in target.simulator.parameters}
     p = np.tile(model.parameters.pack(values), (len(drive), 1))
     row = model.parameters.position(f"{open_.elements[-1].prefix}w").start
-    step = _linearised_step(model, row)
+    step = ca.Function("step", *differentiate_step(model, [row]))
     x0, force = target.x0, target.expected
     best: tuple[float, tuple[np.ndarray, np.ndarray, np.ndarray]] | None = None
     size: tuple[float, float] | None = None
@@ -381,14 +388,6 @@ def _recover(
     states = states[:, : len(target.simulator.states)]
     z, dz = _local_motion(bench, target.simulator, values, target.port, states, r.slice(window.start, window.stop))
     return z, dz, force[:-1], std[:-1]
-
-
-def _linearised_step(model: Model, row: int) -> ca.Function:
-    """Make a step that also returns the derivatives of next state and output by the state and by parameter `row`."""
-    x, u, q = ca.SX.sym("x", model.n_state), ca.SX.sym("u", model.n_u), ca.SX.sym("p", model.parameters.size)
-    following, y = model.closed(x, u, q)
-    blocks = [ca.densify(ca.jacobian(e, v)) for e, v in ((following, x), (following, q[row]), (y, x), (y, q[row]))]
-    return ca.Function("step", [x, u, q], [y, *blocks])
 
 
 def _local_motion(

@@ -57,6 +57,18 @@ class ProbeForce(Law):
         return p.w
 
 
+def differentiate_step(model: Model, columns: Sequence[int] = ()) -> tuple[tuple[ca.SX, ...], list[ca.SX]]:
+    """Return symbols x (with memory), u, p of a model's step, and y, A, B, C, D there.
+
+    B and D have a column for each entry of p in `columns`.
+    """
+    x, (u, p) = ca.SX.sym("x", model.n_state), model.symbols()[2:]
+    following, y = model.closed(x, u, p)
+    picked = p[list(columns)]
+    blocks = [ca.jacobian(e, v) for e, v in ((following, x), (following, picked), (y, x), (y, picked))]
+    return (x, u, p), [y, *map(ca.densify, blocks)]
+
+
 @dataclass(frozen=True, eq=False)
 class Probe:
     """One step of the probed simulator at fitted values, its derivatives, and the local signals of its ports."""
@@ -77,14 +89,11 @@ class Probe:
         for port in simulator.all_ports():
             probed = probed.with_element(port.name, ProbeForce())
         model = discretise(probed, bench.dt, bench.hold, fitted.model.substeps)
-        x, (u, p) = ca.SX.sym("x", model.n_state), model.symbols()[2:]
-        following, y = model.closed(x, u, p)
         values = pack_known(model.parameters, fitted.values)
         names = tuple(port.name for port in simulator.all_ports())
         free = np.flatnonzero(model.parameters.free)
-        picked = p[free.tolist()]
-        blocks = [ca.jacobian(e, v) for e, v in ((following, x), (following, picked), (y, x), (y, picked))]
-        at = ca.substitute([y, *map(ca.densify, blocks)], [p], [ca.SX(values)])  # fold constants
+        (x, u, p), blocks = differentiate_step(model, free.tolist())
+        at = ca.substitute(blocks, [p], [ca.SX(values)])  # fold constants
         step = ca.Function("probe", [x, u], ca.cse(at))
         return cls(model, step, signals(simulator), values, free, names, len(simulator.states))
 

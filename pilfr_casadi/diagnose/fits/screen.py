@@ -173,6 +173,7 @@ def _windows(bench: Workbench, runs: Sequence[Run]) -> list[slice]:
 
 
 def _tasks(bench: Workbench, probe: Probe, laws: Sequence[type[Law]], runs: list[Run], short: list[Run]) -> list[Task]:
+    """Make a task for each port that moves, except equations that only define a rate; sensors come last."""
     by_name = {port.name: port for port in bench.simulator.all_ports()}
     definitions = {port_name(EQUATION, state) for state in bench.simulator.kinematic}
     out = []
@@ -345,6 +346,7 @@ def _stays_bounded(r: Run, scale: np.ndarray) -> bool:
 
 
 def _score(rest: Remainder, task: Task, source: str) -> list[Scored]:
+    """Score each law of a port by its best shape, with its start values."""
     total, out = max(float(rest.left @ rest.left), 1e-300), []
     for law, doses in rest.doses(task):
         sense, scores = rest.runs[0].sense(law, task.index), []

@@ -161,6 +161,11 @@ class Workbench:
         """Sampling interval, s."""
         return self.recordings[0].dt
 
+    @property
+    def stacked_inputs(self) -> np.ndarray:
+        """Inputs (M, n_u) of all recordings, one after the other."""
+        return np.concatenate([r.u for r in self.recordings])
+
     def unit_of(self, channel: str) -> str:
         """Return the unit of an input or output, "" if it is unknown; that of the recordings comes first."""
         return {**self.simulator.units, **self.recordings[0].units}.get(channel, "")
@@ -349,6 +354,10 @@ class Workbench:
         path: tuple[float, ...],
         solver: GaussNewton,
     ) -> tuple[float, np.ndarray, Problem, Status] | None:
+        """Fit from one start through injection gains down to none; None if it diverges.
+
+        A large gain keeps the run near the recordings, so that a poor start does not end in a wrong minimum.
+        """
         model, parameters = one.model, one.model.parameters
         vector = start_vector(model, start)
         states = [model.first_state(r) for r in self.recordings]

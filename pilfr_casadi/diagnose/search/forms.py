@@ -10,13 +10,12 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any, TypeVar, cast
+from typing import Any, TypeVar
 
 import numpy as np
 
 from ..._base import side_by_side
 from ...laws import (
-    FINER,
     LINEAR,
     SCALABLE,
     VARIATIONS,
@@ -26,6 +25,7 @@ from ...laws import (
     constant,
     heated,
     likely_profiles,
+    related_forms,
     scheduled,
     unit_forces,
     varying,
@@ -45,6 +45,8 @@ T = TypeVar("T")
 R = TypeVar("R")
 
 MOST_CONVERGED = 5  # trials of a move that are fitted to convergence at most
+# mean square of an earlier fit, over that of a law, from which a form that is so related to the law is fitted again
+REFIT_RATIO = {"finer": EQUAL_RATIO, "plainer": NEAR_RATIO**2 * EQUAL_RATIO, "other": np.inf}
 MATCHED_SAMPLES = 4000  # approximate number of samples on which a law is matched to a force
 
 
@@ -161,14 +163,12 @@ class Forms(Hypotheses):
         A form that was fitted before is fitted again if that fit was in a wrong minimum: it contains the law and
         follows worse, or it is the plainer law and far worse.
         """
-        kind, others, most = type(trial.law), trial.key - {trial.pair}, EQUAL_RATIO * trial.mean_square
-        port, base = self.bench.simulator.port(trial.port), cast(Any, kind.__base__)
-        if not (base in self.laws and base.units.items() <= kind.units.items() and base.shares_values()):
-            base = None  # its values are of another kind
-        related = [*FINER.get(kind, ()), *(k for k in self.laws if k.extends(kind) or k is base)]
-        limits = {k: NEAR_RATIO**2 * most if k is base else most if issubclass(k, kind) else np.inf for k in related}
-        known = {k: self.memo.get(others | {(trial.port, k)}) for k in related if port.admits(k)}
-        self.fit_forms(trial, [k for k, fit in known.items() if fit is None or fit.mean_square > limits[k]])
+        port, others, kinds = self.bench.simulator.port(trial.port), trial.key - {trial.pair}, []
+        for kind, relation in related_forms(type(trial.law), self.laws).items():
+            known = self.memo.get(others | {(trial.port, kind)})
+            if port.admits(kind) and (known is None or known.mean_square > REFIT_RATIO[relation] * trial.mean_square):
+                kinds.append(kind)
+        self.fit_forms(trial, kinds)
 
     def _vary_strength(self) -> None:
         """Let the strength of the likeliest law of the last move that may vary do so, with every signal.

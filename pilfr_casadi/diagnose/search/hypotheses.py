@@ -94,7 +94,9 @@ class Hypotheses:
     count: float = FEWEST  # samples of the best residual over its correlation time
     # mean squares of the mismatch (n_y,) for `tolerance`; None: those of the refit
     mismatch2: np.ndarray | None = None
-    _least: tuple[tuple[object, ...], float] | None = None  # what `_least_tolerant` rests on, and its value
+    _least: tuple[tuple[object, ...], float] | None = (
+        None  # the objects that `_least_tolerant` was computed from, and its value
+    )
 
     @cached_property
     def fits(self) -> Trials:
@@ -218,7 +220,7 @@ class Hypotheses:
     def _held_out_ratio(self, quantile: float) -> float:
         """Compute a quantile of the known ratios of held-out to fit error (mean squares).
 
-        Of two ratios the median is the smaller: one hypothesis that predicts badly says nothing about the others.
+        The median of two ratios is the smaller: one hypothesis that predicts badly says nothing about the others.
         """
         known = [(self.findings[key].held_out, trial.mean_square) for key, trial in self.memo.items()]
         ratios = [h.mean_square / fit for h, fit in known if h and np.isfinite(h.mean_square) and fit > 0]
@@ -470,8 +472,8 @@ class Hypotheses:
     def is_driven(self) -> bool:
         """Whether the power of the refit's residual follows the inputs, the simulated outputs or their rates.
 
-        That of noise does not. The measured outputs hold the noise itself, and their rates hardly anything else where
-        the machine is slow.
+        The power of noise does not. The measured outputs hold the noise itself, and their rates hardly anything else
+        where the machine is slow.
         """
         known, fitted = self.findings[self.root.key], self.root.fitted
         if known.driven is None:

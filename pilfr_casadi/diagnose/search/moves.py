@@ -17,10 +17,10 @@ import numpy as np
 
 from ..._base import InputError
 from ...laws import constant
-from ...simulators import ACTUATOR, PARAMETER, SENSOR, kind_of, name_at, port_name
+from ...simulators import ACTUATOR, PARAMETER, SENSOR, kind_of, port_name
 from ..faults.gates import CLEARLY_BETTER, Checked, Gate
 from ..faults.timing import TimeShift, find_time_shift
-from ..fits.evidence import BETTER_RATIO, FAR_RATIO, LEAST_FORMULA_ERROR
+from ..fits.evidence import BETTER_RATIO, FAR_RATIO, LEAST_FORMULA_ERROR, cap_mismatch
 from ..fits.floor import ABOVE_NOISE
 from ..fits.linearise import linearise_runs
 from ..fits.screen import Remainder, Scored
@@ -86,7 +86,7 @@ class Search(Forms):
         while (
             self.can_improve(self.best)
             and len((parent := self._parent(varied)).effects) < self.most_effects
-            and self._was_worth_it(parent)
+            and self._is_worth_its_prior(parent)
             and (self.may_go_on() or not self.moves)
         ):
             self.add(parent)
@@ -122,7 +122,7 @@ class Search(Forms):
         An inexact formula can look like one more effect. The law is therefore kept only if the remaining residual can
         be white noise. Residuals below LEAST_FORMULA_ERROR are skipped.
         """
-        base, least = self.best, LEAST_FORMULA_ERROR * min(self.root.mean_square, 1.0)
+        base, least = self.best, LEAST_FORMULA_ERROR * self.bench.pool(cap_mismatch(self.root.fitted.squares))
         is_noise = base.mean_square < ABOVE_NOISE**2 * self.least_noise2 + least
         if not base.laws or is_noise or base.mean_square > self.may_leave() or not self.may_go_on():
             return
@@ -169,7 +169,7 @@ class Search(Forms):
         self.compare_effects()
         self.cross_validate_likeliest()
 
-    def _was_worth_it(self, trial: Trial) -> bool:
+    def _is_worth_its_prior(self, trial: Trial) -> bool:
         """Tell whether the last of several laws was worth it; a wrong model gains from any further law."""
         fewer = [t for t in self.memo.values() if t.laws and len(t.effects) < len(trial.effects)]
         return len(trial.effects) < 2 or self.evidence(trial) > max(map(self.evidence, fewer), default=-np.inf)
@@ -206,8 +206,7 @@ class Search(Forms):
                 found = find_time_shift(Checked(bench, trial.fitted), shift_step, given=False)
                 shift = found.gates[0] if found.gates else None
                 if isinstance(shift, TimeShift) and shift.leads and found.cost < best:
-                    beside = name_at(trial.port, trial.law.id, trial.law.form)
-                    sentence = f"{shift.sentence.rstrip('.')} (beside {beside})."
+                    sentence = f"{shift.sentence.rstrip('.')} (beside {trial.element.words})."
                     best, self.shift = found.cost, replace(shift, sentence=sentence)
         self.aligned = True
 

@@ -37,9 +37,7 @@ def complements(one: Law, other: Law) -> bool:
     stand beside any force without such a mass. The path of a signal may have a delay, a lag, and a curve
     or a memory of its size.
     """
-    if "offset" in (one.id, other.id):
-        return one.id != other.id
-    if any(isinstance(law, TermLimit) for law in (one, other)):
+    if any(law.id == "offset" or isinstance(law, TermLimit) for law in (one, other)):
         return one.id != other.id
     if "delay" in (one.id, other.id) or any(
         law.id == "extra_mode" and law.places == ("series",) for law in (one, other)

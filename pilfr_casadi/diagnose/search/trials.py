@@ -161,7 +161,7 @@ class Trials:
             return self.bench
         residual = self.residual or [np.zeros_like(r.y) for r in self.bench.recordings]
         powers = [np.sum((e / self.bench.scale) ** 2, axis=1) for e in residual]
-        return self.bench.on([_head(r, share, p) for r, p in zip(self.bench.recordings, powers, strict=True)])
+        return self.bench.on([_cut_head(r, share, p) for r, p in zip(self.bench.recordings, powers, strict=True)])
 
     def fit(
         self, simulator: Simulator, starts: Sequence[Mapping[str, Any]], count: int, **options: Any
@@ -346,7 +346,7 @@ def _agree(found: Sequence[Trial | None]) -> bool:
     return len(costs) > 2 and costs[2] < EQUAL_RATIO * costs[0]
 
 
-def _head(r: Recording, share: float, power: np.ndarray) -> Recording:
+def _cut_head(r: Recording, share: float, power: np.ndarray) -> Recording:
     """Return the first part of a recording, longer if its residual is far quieter than later.
 
     A recording may begin at rest, where most laws do not act. Then the part ends with the first loud stretch. It begins
@@ -385,10 +385,10 @@ def select_pairs(scored: Sequence[Scored], few: bool) -> list[list[Scored]]:
         if s.pair in chosen:
             chosen[s.pair].append(s)
     kept = ([s for s in found if s.share > LEAST_SHARE * largest[s.source]] or found for found in chosen.values())
-    return sorted(kept, key=lambda found: max(map(_promise, found)), reverse=True)
+    return sorted(kept, key=lambda found: max(map(_estimate_evidence, found)), reverse=True)
 
 
-def _promise(one: Scored) -> float:
+def _estimate_evidence(one: Scored) -> float:
     """Estimate the log evidence of a law from its screen: the samples of a wrong model count, and a nat per number."""
     return float(-0.5 * WRONG_MODEL_SAMPLES * np.log(max(1 - one.share, 1e-300)) - one.law.size(one.starts[0]))
 

@@ -12,7 +12,7 @@ from pilfr_casadi._base import Stages
 from pilfr_casadi.diagnose import Workbench
 from pilfr_casadi.diagnose.faults.tones import find_ringing_mode, find_tone, find_tones
 from pilfr_casadi.diagnose.fits.floor import Floor
-from pilfr_casadi.diagnose.pipeline import with_tones
+from pilfr_casadi.diagnose.pipeline import add_tones
 from pilfr_casadi.diagnose.posterior import Posterior
 from pilfr_casadi.diagnose.search.moves import Search
 from pilfr_casadi.diagnose.search.trials import Trial
@@ -92,7 +92,7 @@ def test_hum_explains_nothing_of_physics_that_has_lost_its_name():
         search.keep(Trial.of(fitted, count, thorough=True))
     withdrawn = Posterior(search.best, 0.0, (), 0.0)
     assert search.best.laws and find_tones(bench, named)
-    assert judge(search, withdrawn, with_tones(search, withdrawn, ())).kind == "unexplained"
+    assert judge(search, withdrawn, add_tones(search, withdrawn, ())).kind == "unexplained"
 
 
 @pytest.mark.slow

@@ -5,7 +5,15 @@ from diagnosis_example import recorded, rig
 
 import pilfr_casadi as pilfr
 from pilfr_casadi import Parameter, Port, Recording, Simulator
-from pilfr_casadi.laws import FreeCurve, PreslidingFriction, PreslidingStribeckFriction
+from pilfr_casadi.laws import (
+    FINER,
+    FreeCurve,
+    GeneralizedHysteresis,
+    PlayHysteresis,
+    PreslidingFriction,
+    PreslidingStribeckFriction,
+    related_forms,
+)
 
 
 def test_the_plainer_law_starts_from_the_values_of_the_finer_one():
@@ -45,3 +53,15 @@ def test_a_voltage_that_falls_steeply_where_a_cell_runs_empty_is_followed():
     found = pilfr.diagnose(simulator, train, laws=(FreeCurve,), workers=1)
     assert [(e.law, e.form) for e in found.effects] == [("static_curve", "free with a steep end")]
     assert found.errors["train"]["after"] < 0.008 < 0.3 < found.errors["train"]["before"]
+
+
+def test_plain_plays_are_not_fitted_from_the_values_of_bent_ones():
+    """They have no bend, and plays that start from others are split into two."""
+    port, bent = "actuator:force", GeneralizedHysteresis
+    own = {"w": np.array([-0.6, 0.1, 0.2, 0.1, 0.1, 0.1]), "r": np.linspace(0.0, 8.0, 6), "a_2": 0.015, "b_2": 0.0}
+    train = recorded(rig().with_element(port, bent().at(own)), 0, samples=400)
+    search = pilfr.diagnose(rig(430.0, 5.0), train, laws=(bent,), workers=1, hold="zero").evidence.search
+    trial, search.laws = search.memo[frozenset({(port, bent)})], (PlayHysteresis, bent)
+    search.fit_related_forms(trial)
+    assert frozenset({(port, PlayHysteresis)}) not in search.memo
+    assert list(related_forms(bent, search.laws)) == [*FINER[bent]]
