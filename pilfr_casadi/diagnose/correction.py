@@ -2,9 +2,9 @@
 
 If the named answer is not sure, or leaves error above the noise, several candidates compete on held-out parts of the
 training recordings (`evidence`): the refitted simulator; the named laws, all of them and the sure ones alone; all
-likely hypotheses if no law is named; and a learned force, alone or beside laws. The score is the held-out error plus
-the spread of predictions for other inputs (`evidence.spread`), which is large if many parameters are hardly determined.
-A correction without a sure name grows by further laws as long as that predicts better (`_grow`).
+likely hypotheses that have the sure names; and a learned force, alone or beside laws. The correction grows by further
+laws as long as that predicts better (`_grow`). The score is the held-out error plus the spread of predictions for other
+inputs (`evidence.spread`), which is large if many parameters are hardly determined.
 The smallest score wins, unless a candidate with fewer laws, but every sure one, is not clearly worse on the same blocks
 (`_choose`). Candidates are cross-validated in the order of their fit error plus spread, until that exceeds the smallest
 score; those that the search has cross-validated already count as well. When time runs out first, the hypothesis with
@@ -130,6 +130,7 @@ _Validated = tuple[_Candidate, ExpectedError]
 def find_named_correction(search: Search, answer: Posterior) -> tuple[Correction, Fitted]:
     """Choose the corrected simulator if the answer names its effects: with them, or with what predicts better.
 
+    Further laws may stand beside the sure names, as beside a correction that has no name.
     If a learned element at another port predicts better without them, the correction omits them. A learned element at
     the port of a named effect would only imitate it, and is not tried. After an interrupt, and where the time ends
     before a comparison, the named laws stay.
@@ -144,6 +145,8 @@ def find_named_correction(search: Search, answer: Posterior) -> tuple[Correction
     if not validated:
         stays = candidates[0].base
         return replace(uncompared_correction(search, stays.fitted), closest=stays), stays.fitted
+    more = [t for t in _likely_hypotheses(search) if sure <= t.names and all(t.key != c.base.key for c in candidates)]
+    validated = _grow(search, _cross_validate(search, _polish(search, more), validated), sure)
     chosen = _choose(validated, sure)[0].base
     learned = _learned_candidates(search, search.memo[(chosen if chosen.laws else best).key])
     learned += _learned_candidates(search, search.root, taken={e.port for e in best.laws})
@@ -172,13 +175,13 @@ def find_unnamed_correction(search: Search) -> tuple[Correction, Fitted]:
     return _describe_chosen(search, _choose(validated), validated[0], search.least_floor)
 
 
-def _grow(search: Search, validated: list[_Validated]) -> list[_Validated]:
+def _grow(search: Search, validated: list[_Validated], sure: frozenset[Name] = frozenset()) -> list[_Validated]:
     """Add laws to the correction as long as that predicts better.
 
     Few samples count for a model that is wrong throughout, so that no second law is worth its prior; on data that were
     left out it may be clearly better. The search did not look beyond such a correction.
     """
-    while (chosen := _choose(validated)[0].base).laws and len(chosen.effects) < search.most_effects:
+    while (chosen := _choose(validated, sure)[0].base).laws and len(chosen.effects) < search.most_effects:
         if search.expanded(chosen) or not search.may_go_on():
             break
         search.add(chosen)
