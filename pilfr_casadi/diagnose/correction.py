@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from .._base import InputError, percent
+from .._base import InputError, in_words, percent
 from ..laws import CATALOGUE
 from ..simulators import name_at
 from .fits.evidence import FORMULA_ERROR, NEAR_RATIO, SURE, ExpectedError, held_out_errors, runs_away
@@ -56,7 +56,7 @@ class Correction:
         for port, law, form in self.elements:
             learned = "a learned force" + (f" ({form})" if form else "") + f" at {port}"
             names.append(learned if law == LearnedForce.id else name_at(port, law, form))
-        return " and ".join(names)
+        return in_words(names)
 
     @property
     def sentence(self) -> str:

@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from .._base import InputError, listed, percent
+from .._base import InputError, in_words, listed, percent
 from ..data import Recording
 from ..laws import display_name
 from ..simulators import EQUATION, UNKNOWN, Placed, in_series, name_at, split_port
@@ -133,7 +133,7 @@ def _describe_pinned(search: Search, names: Sequence[str], found: Fitted, named:
         kept = "held at" if np.all(p.fixed) else "kept by its bounds at"
         was = value_with_unit(float(without.values[name]), p.unit, 4)
         parts.append(f"{name} = {value_with_unit(value, p.unit, 5)}, which is {kept} {was}")
-    words = " and ".join(f"the {name_at(*placed.name)}" for placed in named)
+    words = in_words([f"the {name_at(*placed.name)}" for placed in named])
     like = f", no further off than with {words}" if named else ""
     what, it, its, given = (
         ("a value", "it", "its", "value is") if len(names) == 1 else ("values", "them", "their", "values are")

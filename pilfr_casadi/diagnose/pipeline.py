@@ -45,7 +45,7 @@ from functools import partial
 
 import numpy as np
 
-from .._base import InputError, deferred_interrupt, one_blas_thread, percent
+from .._base import InputError, deferred_interrupt, in_words, one_blas_thread, percent
 from ..laws import display_name
 from .answer import Conclusion, FinalFits, build_diagnosis
 from .arguments import Request
@@ -231,7 +231,7 @@ def _conclude_without_a_law(search: Search, judged: _Judgement) -> Conclusion | 
     held = find_pinned_parameters(search, answer)
     if held is not None:
         corrected = uncompared_correction(search, held.fitted)
-        freed = " and ".join(held.names)
+        freed = in_words(held.names)
         return Conclusion(Verdict("complete", held.sentence), gates, held.fitted, corrected, freed=freed)
     named = judged.kind == "missing-physics"
     if named and answer.sure >= SURE:
@@ -332,7 +332,7 @@ def _name_in_predictions(request: Request, search: Search, found: Conclusion) ->
     if verdict.kind != "missing-physics" or not better or after.rms > EQUAL_RATIO * found.correction.after:
         return found
     correction = replace(uncompared_correction(search, trial.fitted), before=before.rms, after=after.rms, closest=trial)
-    note = drift_note(request.simulator, memory, " and ".join(display_name(law) for _, law in sorted(trial.names)))
+    note = drift_note(request.simulator, memory, in_words([display_name(law) for _, law in sorted(trial.names)]))
     return replace(
         found,
         verdict=verdict,

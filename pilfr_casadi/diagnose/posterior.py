@@ -283,15 +283,9 @@ def indistinguishable(search: Hypotheses, best: Trial, element: Placed) -> dict[
     # few samples count where all models are wrong, so that one which explains nothing may be about as likely
     nothing = min((t.mean_square for t in hypotheses_named(search, rest)), default=np.inf)
     every = [port_name(SENSOR, name) for name in search.bench.simulator.output_names]
-    for t in forms:
+    for t in (t for t in forms if search.evidence(t) >= least and BETTER_RATIO**2 * t.mean_square <= nothing):
         other = t.names - rest
-        if (
-            search.evidence(t) < least
-            or BETTER_RATIO**2 * t.mean_square > nothing
-            or not rest <= t.names
-            or own in other
-            or not other
-        ):
+        if not rest <= t.names or own in other or not other:
             continue
         if len(other) == 1 and len(t.names) == len(best.names):
             out.setdefault(next(iter(other)), t)

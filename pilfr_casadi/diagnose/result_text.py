@@ -327,7 +327,7 @@ class ResultText:
             lines.append(f"  {role} free: a free run of the {role} recordings; the rows above are predictions")
         noise = f"{self.noise_text(self.floor)} ({self.floor['source']})"
         if self.floor.get("test"):
-            noise += f", on the test recordings {self.noise_text(self.noise_on_tests)}"
+            noise += f", on the test recordings {self.noise_text(self.noise_on_tests)} if they are as noisy"
         return [*lines, f"  noise floor {noise}"]
 
     def noise_text(self, noise: Mapping[str, float], write: Callable[[float], str] | None = None) -> str:

@@ -137,7 +137,7 @@ def _is_noise(search: Hypotheses, quiet: float, explained: bool, mode: float | N
 def _describe_effects(search: Hypotheses, found: Posterior) -> str:
     """Name the effects, those with a sure name first."""
     sure, unsure = (
-        " and ".join(e.words for e in found.effects if (e.confidence > SURE) is known) for known in (True, False)
+        in_words([e.words for e in found.effects if (e.confidence > SURE) is known]) for known in (True, False)
     )
     names_are = "names are" if " and " in unsure else "name is"
     placed = all(e.confidence > SURE or e.at_port > SURE for e in found.effects)
@@ -239,7 +239,7 @@ def _describe_unexplained(search: Hypotheses, closest: Trial, shares: dict[str, 
     # after the time limit, this may not be worth another minute
     looked = search.findings[closest.key].flexible is not None or not search.out_of_time
     rest = max(search.flexible(closest).values(), default=0.0) if looked else 0.0
-    words = " and ".join(e.words for e in laws)
+    words = in_words([e.words for e in laws])
     named = f"laws, {words}, remove" if laws[1:] else f"law, {words}, removes"
     if left < FORMULA_ERROR:
         them, sure = ("they are", "names are") if laws[1:] else ("it is", "name is")

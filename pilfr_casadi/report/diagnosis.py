@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from .. import plots
-from .._base import InputError, make_folder, write_atomically
+from .._base import InputError, in_words, make_folder, write_atomically
 from ..data import COURSES
 from ..diagnose import (
     BeforeAfter,
@@ -303,7 +303,7 @@ def _candidates(d: Diagnosis) -> list[Block]:
     passes = tables.candidates_by_pass(d)
     out: list[Block] = [Text(tables.CANDIDATES)] if passes else []
     for rows, parent in passes:
-        laws = "" if parent is None else " and ".join(name_at(*e.name) for e in parent.laws)
+        laws = "" if parent is None else in_words([name_at(*e.name) for e in parent.laws])
         title = f"Fitted in addition to {laws}" if laws else "All fitted pairs of port and law"
         error = None if parent is None else float(parent.error)
         out += tables.candidate_tables(rows, d.effects, title, d.floor["nrmse"], error)

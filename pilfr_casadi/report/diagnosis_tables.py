@@ -170,6 +170,8 @@ def error_table(diagnosis: Diagnosis) -> Table:
     )
     if diagnosis.floor["source"] == "estimated":
         note += " The noise floor is estimated from the residual; coloured noise would make it larger."
+    if diagnosis.errors.get("test"):
+        note += " On the test recordings it holds if they are as noisy as the training recordings."
     emphasis = [len(rows) - 1 - predicted]
     return Table(["recordings", *steps.values(), "noise floor"], rows, note=note, emphasis=emphasis)
 

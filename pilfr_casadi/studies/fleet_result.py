@@ -14,7 +14,17 @@ from typing import Any
 
 import numpy as np
 
-from .._base import InputError, csv_text, json_text, make_folder, read_bytes, to_json, with_nan, write_atomically
+from .._base import (
+    InputError,
+    csv_text,
+    in_words,
+    json_text,
+    make_folder,
+    read_bytes,
+    to_json,
+    with_nan,
+    write_atomically,
+)
 from ..data import Recording
 from ..diagnose import SURE, check_laws, replicate
 from ..laws import Law
@@ -185,7 +195,7 @@ class Common:
     @property
     def words(self) -> str:
         """The laws in words."""
-        return " and ".join(name_at(law.port, law.id, law.form) for law in self.laws)
+        return in_words([name_at(law.port, law.id, law.form) for law in self.laws])
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,7 +15,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from .._base import InputError, digest, json_text, to_json
+from .._base import InputError, digest, in_words, json_text, to_json
 from ..data import Recording, fingerprint
 from ..diagnose import (
     Diagnosis,
@@ -143,7 +143,7 @@ class MachineWork:
 
     def _sample(self, job: MachineJob) -> Outcome:
         found = self._diagnose(self.simulator, job.recordings)
-        named = " and ".join(name_at(e.port, e.law, e.form) for e in found.effects) or "no law"
+        named = in_words([name_at(e.port, e.law, e.form) for e in found.effects]) or "no law"
         sentence = f"Diagnosed alone, it suggests {named}; the comparison with the other machines decides."
         sentence = " ".join([sentence, *found.corrected_faults])
         entry = {**_diagnosis_entry(found), "sentence": sentence, "hypotheses": self._hypotheses(found)}

@@ -75,7 +75,7 @@ def test_the_noise_is_told_relative_to_each_recording(diagnosed, tmp_path):
     noise = found.floor["test"]["nrmse"]
     assert noise == pytest.approx(found.evidence.noise[0] / np.std(test.y)) and noise != found.floor["nrmse"]
     quiet = replace(found, floor={**found.floor, "test": {"nrmse": 0.1, "white": 0.1}})
-    assert "(estimated), on the test recordings 0.1000" in str(quiet)
+    assert "(estimated), on the test recordings 0.1000 if they are as noisy" in str(quiet)
     page = diagnosis_report(quiet, tmp_path).read_text()
     assert "the noise floor is 10\xa0%." in page and page.count(">10\xa0%<") == 2  # figures of merit, table of errors
 
