@@ -159,6 +159,20 @@ def test_laws_stay_if_the_time_ends_in_the_search_with_a_shorter_memory(monkeypa
     assert repeated and [(e.port, e.law) for e in found.effects] == [("rails", "coulomb_friction")]
 
 
+def test_effects_that_a_short_memory_hardly_shows_stay_if_they_are_the_likeliest_there_too(monkeypatch):
+    """A sensor with little noise favours a memory of a sample, with which the simulator hardly predicts at all."""
+
+    def forget_within_a_sample(search, simulator, memory):
+        gain = observer(simulator, search.bench.recordings, search.bench.hold, 0.12)
+        return replace(simulator, observer=gain), 0.12
+
+    monkeypatch.setattr(repetitions, "forget_sooner", forget_within_a_sample)
+    laws = (Gain, CoulombFriction)
+    found = pilfr.diagnose(cart(), pushed(0.4, 0.02, 1e-3), laws=laws, focus="prediction", workers=1)
+    assert [(e.port, e.law) for e in found.effects] == [("rails", "coulomb_friction")]
+    assert "shows them too little" in str(found) and "forget its past within 4 s" in str(found)
+
+
 def test_predictions_are_advised_if_a_free_run_drifts_and_took_all_the_time(monkeypatch):
     monkeypatch.setattr(Search, "cut_short", True)
     found = pilfr.diagnose(cart(), pushed(0.4, 0.3, 2e-3), laws=(Gain,), workers=1)
