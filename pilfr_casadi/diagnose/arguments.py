@@ -26,7 +26,7 @@ from ..laws import (
     scheduled,
     seen_by,
 )
-from ..simulators import Simulator, as_simulator, check_hold, stated_hold
+from ..simulators import Simulator, as_simulator, check_hold, may_be_flow, stated_hold
 from .faults.gates import Gate, edited
 from .preparation import conversions, slow_note
 from .search.stretches import SEARCHED_SAMPLES, Stretches
@@ -252,10 +252,10 @@ def add_scaled_laws(laws: Sequence[type[Law]], simulator: Simulator) -> tuple[ty
     """Return the laws, and versions of some of them whose strength varies with a signal.
 
     An input that the equations do not read may act itself, or scale a law; any other may reach a sensor, or the channel
-    of another input, directly. Any input may be a flow that carries signals along. A spring or damper of the
-    simulator's own may vary with the time, an input, or a port's own signal, and a damper with the position. Other laws
-    are found first, and then let vary (`Search`). Of several sensors at an elastic joint or drive, one alone may be on
-    the far side.
+    of another input, directly. An input whose unit allows it may be a flow that carries signals along. A spring or
+    damper of the simulator's own may vary with the time, an input, or a port's own signal, and a damper with the
+    position. Other laws are found first, and then let vary (`Search`). Of several sensors at an elastic joint or drive,
+    one alone may be on the far side.
     """
     given = {law.__name__ for law in laws}  # in a worker, classes made at run time are others of the same name
     all_laws = given >= {law.__name__ for law in CATALOGUE}
@@ -264,7 +264,8 @@ def add_scaled_laws(laws: Sequence[type[Law]], simulator: Simulator) -> tuple[ty
     by_input = [scaled(law, by) for law in may_scale for by in simulator.idle_inputs]
     by_input += [scheduled(law, by) for law in alone for by in simulator.idle_inputs]  # with a constant beside it
     by_input += [scaled(Feedthrough, by) for by in simulator.inputs if all_laws and by not in simulator.idle_inputs]
-    carrying = [carried(by) for by in simulator.inputs if all_laws]
+    flows = [name for name in simulator.inputs if may_be_flow(simulator.units.get(name, ""))]
+    carrying = [carried(by) for by in flows if all_laws]
     signals = ["t", *simulator.inputs, *sorted({name for port in simulator.ports for name in port.signals})]
     pairs = [(law, by) for law in (LinearStiffness, ViscousDamping) for by in signals] + [(ViscousDamping, "z")]
     varying = [scheduled(law, by, "quadratic") for law, by in pairs if law in laws]

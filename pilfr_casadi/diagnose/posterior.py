@@ -187,10 +187,22 @@ def posterior(search: Hypotheses) -> Posterior:
             break
         likeliest_names = fewer
     named = share_named(explainable_remainder(search, best), _odds_against(search, best, best.effects))
-    effects = (e.times(_named_beside(search, best, e)) for e in found)
-    strongest_first = sorted(effects, key=lambda e: -(_without(search, best, e) or search.root).mean_square)
-    answer = Posterior(best, named, tuple(strongest_first), by_names.get(frozenset(), 0.0))
+    found.sort(key=lambda e: -(_without(search, best, e) or search.root).mean_square)
+    effects = _as_physics(found, [_named_beside(search, best, e) for e in found])
+    answer = Posterior(best, named, effects, by_names.get(frozenset(), 0.0))
     return answer.acting(search, best)
+
+
+def _as_physics(strongest_first: Sequence[LikelyEffect], named: Sequence[float]) -> tuple[LikelyEffect, ...]:
+    """Weigh each effect by the probability that its law is the physics, and that of larger effects at its port.
+
+    Beside a large one of a wrong law, a small one only corrects that.
+    """
+    out = list[LikelyEffect]()
+    for i, effect in enumerate(strongest_first):
+        at_port = [p for e, p in zip(strongest_first[:i], named, strict=False) if e.element.port == effect.element.port]
+        out.append(effect.times(min([named[i], *at_port])))
+    return tuple(out)
 
 
 def _named_beside(search: Hypotheses, best: Trial, effect: LikelyEffect) -> float:

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
         MECHANICAL as MECHANICAL,
         UNKNOWN as UNKNOWN,
         infer_domain as infer_domain,
+        may_be_flow as may_be_flow,
     )
     from .equations import (
         Named as Named,

@@ -18,6 +18,8 @@ MECHANICAL = "mechanical"
 DOMAINS = (MECHANICAL, "thermal", "electrical", "fluid")
 UNKNOWN = "unknown"
 
+FLOWS = ("m^3/s", "kg/s", "m/s", "rad/s", "1", "V", "A")  # of what carries a signal along, and of commands to its drive
+
 _ROTATION_UNITS = {"rad", "deg", "rpm"}  # occur in mechanics alone
 
 # domains of the dimensions that are neither thermal nor electrical; others may be anything
@@ -67,6 +69,15 @@ def may_be_speed(unit: str) -> bool:
     """
     size = dimension(unit)
     return not unit or (unit.endswith("/s") if size is None else size in ((0, 1, -1, 0, 0), (0, 0, -1, 0, 0)))
+
+
+def may_be_flow(unit: str) -> bool:
+    """Tell whether a unit may belong to what moves a fluid or a belt: a flow, a speed, or a drive's command.
+
+    >>> [may_be_flow(unit) for unit in ("L/min", "kg/h", "rpm", "%", "", "degC", "W", "N")]
+    [True, True, True, True, True, False, False, False]
+    """
+    return any(may_convert(unit, of_flow) for of_flow in FLOWS)
 
 
 def is_motion(unit: str) -> bool:

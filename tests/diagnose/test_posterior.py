@@ -278,6 +278,16 @@ def test_a_law_that_degenerates_at_its_values_names_nothing_however_well_it_foll
     assert posterior(search(trial(CUBIC))).named < 0.5
 
 
+@pytest.mark.parametrize(("port", "sure"), [("a", False), ("b", True)])
+def test_a_small_effect_is_not_surer_than_a_large_one_at_its_port(search, trial, monkeypatch, port, sure):
+    """Beside a wrong law, it only corrects that."""
+    small = (port, CubicStiffness)
+    monkeypatch.setattr(CoulombFriction, "doubtful", lambda *_: True)
+    found = posterior(search(trial(DRY, small), trial(DRY, left=0.1), trial(small, left=0.9)))
+    confidence = sure_of(found)
+    assert confidence[DRY_NAME] < 0.5 and (confidence[port, "cubic_stiffness"] > 0.9) == sure
+
+
 def test_effective_samples_follow_the_hypotheses_and_are_counted_once(search, trial, monkeypatch):
     found, pooled = search(trial(DRY, left=0.5), trial(CUBIC, left=0.2)), []
     whole = type(found)._tolerant
