@@ -74,7 +74,7 @@ def test_a_constant_of_a_sensor_is_found_and_kept():
     uncertain = [gate], fitted, {gate.parameter: np.array(0.3)}
     assert not update_offsets(*uncertain, True, False)  # the effects may have replaced it
     (told,) = update_offsets(*uncertain, False, False)  # the refitted simulator has it
-    assert told.sentence.endswith("its value is uncertain: it may be zero.")
+    assert told.sentence.endswith(f"Beside the correction it is {gate.value:.3g} m, and may be zero.")
 
 
 @pytest.mark.parametrize("initial", ["zero", "estimate"])

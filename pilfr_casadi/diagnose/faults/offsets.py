@@ -490,6 +490,9 @@ def update_offsets(
     """
     alike = {g.parameter: g.alike for g in gates if isinstance(g, SharedOffset)}
     fitted = {g.parameter: g for g in list_offsets(after.simulator.elements, after.values, after.simulator, alike)}
+    units = {
+        name: after.simulator.port(e.port).unit for name, e in find_placed_offsets(after.simulator.elements).items()
+    }
     # standard errors count the samples that are independent for any parameter
     ratio = (effective_size(after.residual) / samples_of_mean(after.residual)) ** 0.5
     out = []
@@ -505,7 +508,8 @@ def update_offsets(
         sentence = remaining.sentence if effects else gate.sentence  # the value before the effects says little
         if not sure:
             sentence += " As long as the mismatch has no sure name, it may be a part of that."
-        if replaced:
-            sentence += " Beside the correction its value is uncertain: it may be zero."
+        before, now = (value_with_unit(g.value, units.get(gate.parameter, "")) for g in (gate, remaining))
+        if not effects and (replaced or now != before):
+            sentence += f" Beside the correction it is {now}{', and may be zero' if replaced else ''}."
         out.append(replace(gate, value=remaining.value, sentence=sentence))
     return tuple(out)
