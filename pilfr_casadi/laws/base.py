@@ -137,6 +137,11 @@ class Local:
         return max(float(np.quantile(np.abs(self.dz), 0.99)), 1e-300)
 
     @cached_property
+    def is_speed(self) -> bool:
+        """Whether z is itself the speed, at a port without a position."""
+        return np.array_equal(self.z, self.dz)
+
+    @cached_property
     def one_way(self) -> bool:
         """Whether z hardly turns round, so that any force with a memory of turning points is a curve of z."""
         steps = np.diff(self.z)

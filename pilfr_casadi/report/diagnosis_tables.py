@@ -410,7 +410,8 @@ def _collect_correction(diagnosis: Diagnosis) -> dict[str, Any]:
 def _write_law_expression(law: Any) -> tuple[tuple[Any, ...], str]:
     """Return the imports and the Python expression that make the class of a law."""
     if getattr(law, "factor", ""):
-        return (learned_force,), f"learned_force({law.factor!r})"
+        of_speed = ", of_speed=True" if "z_0" not in law.units else ""
+        return (learned_force,), f"learned_force({law.factor!r}{of_speed})"
     if issubclass(law, VaryingParameter) and law.signal:
         return (heated,), f"heated({law.signal!r})"
     if issubclass(law, VaryingParameter):

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
-from pilfr_casadi import Parameter, Port, Recording, Simulator, diagnose
+from pilfr_casadi import Diagnosis, Parameter, Port, Recording, Simulator, diagnose
 from pilfr_casadi.laws import CATALOGUE, Clearance, CoulombFriction, CubicDamping, PowerWithGain, StribeckFriction
+from pilfr_casadi.simulators import Named
 
 DT, J, B, K, F_C = 0.01, 2e-3, 1e-3, 0.08, 0.03  # s, kg m², N m s, N m/A, N m
 TRIED = (CoulombFriction, StribeckFriction, CubicDamping, PowerWithGain)
@@ -30,8 +33,13 @@ def shaft(**options: object) -> Port:
     return Port("shaft", {"w": -1 / J}, lambda x: x.w, **{"unit": "N m", **options})  # type: ignore[arg-type]
 
 
-def measured(seed: int) -> Recording:
-    """The drive with dry friction, its speed with noise."""
+def dry(w: float) -> float:
+    """Torque of a dry friction."""
+    return F_C * np.tanh(w / 0.3)
+
+
+def measured(seed: int, torque: Callable[[float], float] = dry) -> Recording:
+    """The drive with a torque that its simulator lacks, its speed with noise."""
     rng = np.random.default_rng(seed)
     t, fine = np.arange(700) * DT, 40
     i = sum(
@@ -42,7 +50,7 @@ def measured(seed: int) -> Recording:
     for now in i:
         out.append(w)
         for _ in range(fine):
-            w += DT / fine * (K * now - B * w - F_C * np.tanh(w / 0.3)) / J
+            w += DT / fine * (K * now - B * w - torque(w)) / J
     y = np.array(out)
     return Recording(i, y + 0.003 * np.std(y) * rng.standard_normal(len(y)), DT, ("i",), ("speed",))
 
@@ -117,3 +125,27 @@ def test_no_law_of_a_position_is_admitted_at_a_speed(units: dict[str, str]) -> N
     assert {"coulomb_friction", "stribeck_friction", "cubic_damping"} <= {
         law.id for law in CATALOGUE if port.admits(law)
     }
+
+
+@pytest.fixture(scope="module")
+def braked() -> Diagnosis:
+    """The diagnosis of a drive with an eddy-current brake, whose torque falls at high speed; no law tried does."""
+
+    def torque(w: float) -> float:
+        return 0.1 * (w / 8) / (1 + (w / 8) ** 2)
+
+    train, test = (measured(seed, torque) for seed in (0, 1))
+    return diagnose(drive(shaft(across_unit="rad/s")), train, test=test, laws=(CubicDamping,), workers=1)
+
+
+def test_a_force_of_the_speed_that_no_law_follows_is_learned(braked: Diagnosis) -> None:
+    assert [learned.port for learned in braked.learned] == ["shaft"] and braked.verdict == "unexplained"
+    errors = braked.errors["test"]
+    assert errors["after"] < 0.15 * errors["before"]
+    assert "It holds where the speed is from" in braked.learned[0].sentence
+
+
+def test_a_learned_force_of_the_speed_is_saturated_beyond_the_recordings(braked: Diagnosis) -> None:
+    law = braked.corrected.elements[-1].law
+    far = [float(law.force(np.array(w), Named("p", law.values))) for w in (-1e6, -1e4, 1e4, 1e6)]
+    assert far[0] == pytest.approx(far[1], rel=0.05) and far[2] == pytest.approx(far[3], rel=0.05)

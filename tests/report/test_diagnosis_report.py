@@ -17,7 +17,7 @@ from test_report import EVIL, Reader, own_scripts_alone
 
 from pilfr_casadi import Recording, multisine
 from pilfr_casadi._base import InputError
-from pilfr_casadi.diagnose import Gate, Workbench, diagnose
+from pilfr_casadi.diagnose import Gate, Workbench, diagnose, learned_force
 from pilfr_casadi.diagnose.result_text import Basis
 from pilfr_casadi.laws import (
     CoulombFriction,
@@ -166,6 +166,9 @@ def test_faults_that_were_corrected_stand_right_after_the_verdict_and_in_the_cor
         ("ground", scheduled(scaled(CoulombFriction, "force"), "t")),
         ("ground", scaled(scheduled(CoulombFriction, "force", "quadratic"), "force")),
         ("actuator:force", carried("force")),
+        ("ground", learned_force("force")),
+        ("ground", learned_force(of_speed=True)),
+        ("ground", learned_force("force", of_speed=True)),
         ("force", LimitedTerm),
         ("force", SoftlyLimitedTerm),
     ],

@@ -1,9 +1,10 @@
 """The share of a residual that any force at a port explains.
 
 The test of a law (`screen`) is done for a flexible force: a surface `w(z, ż)` of Chebyshev terms up to the fourth
-degree, with stops, plays and relaxations beside it. Its response is linear in its coefficients, which are fitted to
-every second block of the record by ridge regression and judged on the others, so that noise is not explained. This
-tells noise from missing structure without knowing the floor, and a right name from one that only comes near.
+degree, with stops, plays and relaxations beside it, or curves of the speed at a port that has no position. Its response
+is linear in its coefficients, which are fitted to every second block of the record by ridge regression and judged on
+the others, so that noise is not explained. This tells noise from missing structure without knowing the floor, and a
+right name from one that only comes near.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import Any, ClassVar
 
+import casadi as ca
 import numpy as np
 
 from ...data import Recording
@@ -25,6 +27,9 @@ from .workbench import Fitted, Workbench
 DEGREE = 4  # of the flexible surface
 # degrees in z and dz/dt of the surface's terms
 TERMS = tuple((i, j) for i in range(DEGREE + 1) for j in range(DEGREE + 1 - i) if i + j)
+SPEED_DEGREE = 7  # of the polynomials of a speed
+KNEES = (0.01, 0.05, 0.25)  # of the curves v / (|v| + knee), over the largest speed: from dry friction to a smooth bend
+SPEED_CURVES = SPEED_DEGREE + 2 * len(KNEES)  # number of curves of `speed_curves`
 # limits of samples times squared number of states: of the time beyond LEAST_SAMPLES, and of memory in any case
 MOST_WORK, LEAST_SAMPLES, MOST_MEMORY = 600_000, 2500, 100_000_000
 
@@ -57,8 +62,39 @@ class Surface(Law):
         }
 
 
+class SpeedCurve(Law):
+    """A force of the speed, at a port that has no position: smooth, or bent at rest."""
+
+    id = "speed_curve"
+    equation = "w = sum_j c_j phi_j(dz/dt)"
+    units: ClassVar[Mapping[str, str]] = {"c": "w", "v_s": "z/s"}
+    strength: ClassVar[tuple[str, ...]] = ("c",)
+
+    def force(self, dz: Any, p: Any) -> Any:
+        """Compute the sum of the curves."""
+        curves = speed_curves(dz / p.v_s)
+        return sum(p.c[k] * curve for k, curve in enumerate(curves))
+
+    def parameters(self) -> dict[str, Parameter]:
+        """Return coefficients and the scale of the speed."""
+        return {"c": Parameter(np.zeros(SPEED_CURVES)), "v_s": Parameter(float(self.values.get("v_s", 1.0)))}
+
+    def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
+        """Generate the scale of the data."""
+        yield {"v_s": 1.5 * local.speed}
+
+    def why_not(self, local: Local) -> str:
+        """Say that the port has a position; `Surface` is for those."""
+        return "" if local.is_speed else "the port has a position"
+
+
+def speed_curves(v: Any) -> list[Any]:
+    """Compute curves of a scaled speed: polynomials, and friction that is alike in both directions or not."""
+    return [*chebyshev(v, SPEED_DEGREE)[1:], *(one / (ca.fabs(v) + knee) for knee in KNEES for one in (v, ca.fabs(v)))]
+
+
 # forces that together follow any force at a port
-FLEXIBLE = (Surface, StopHysteresis, PlayHysteresis, Relaxation, Creep)
+FLEXIBLE = (Surface, SpeedCurve, StopHysteresis, PlayHysteresis, Relaxation, Creep)
 
 
 def flexible_shares(bench: Workbench, fitted: Fitted) -> dict[str, float]:

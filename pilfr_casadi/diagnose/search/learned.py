@@ -3,11 +3,11 @@
     w = sum_j (c_j + d_j u~) phi_j(z, dz/dt, stops of z)
 
 The features phi_j are stops of z with fixed thresholds and their powers (loops), low powers of z and |z| (curves), and
-curves of dz/dt (friction), some of them times z. u~ is an input of the simulator, standardised, where one scales the
-force. The force is linear in its weights c and d, which are fitted together with the simulator's own parameters in
-simulation error. They start from the linear solution of the projected sensitivities (`screen`), with a ridge prior on
-the size of the force; held-out blocks choose its strength. This is the discrepancy of Kennedy & O'Hagan
-(2001, J. R. Statist. Soc. B 63), placed inside the loop.
+curves of dz/dt (friction), some of them times z; at a port that has no position, curves of the speed. u~ is an input of
+the simulator, standardised, where one scales the force. The force is linear in its weights c and d, which are fitted
+together with the simulator's own parameters in simulation error. They start from the linear solution of the projected
+sensitivities (`screen`), with a ridge prior on the size of the force; held-out blocks choose its strength. This is the
+discrepancy of Kennedy & O'Hagan (2001, J. R. Statist. Soc. B 63), placed inside the loop.
 
 Outside the range of z, dz/dt and u in the training recordings, the signals are saturated: the force changes a little
 further and then stays constant. The saturation has a nonzero slope everywhere, so an unknown initial state can be
@@ -28,6 +28,7 @@ import numpy as np
 from ..._base import InputError, side_by_side
 from ...laws import POSITION_GAINS, SCALABLE, Law, Local, display_name, likely_profiles, scaled, scheduled, unit_forces
 from ...models import Parameter, play
+from ..fits.flexible_forces import KNEES, SPEED_CURVES, speed_curves
 from ..fits.force_recovery import signals_along
 from ..fits.linearise import linearise_runs, loudest_stretch, port_signals
 from ..fits.screen import Remainder, Task, fit_shapes, held_out_rest, lengths, ridge_solution, start_values, usable
@@ -38,8 +39,6 @@ STOPS = 8  # number of stops
 # start
 THRESHOLDS = np.geomspace(0.02, 0.7, STOPS)
 POWERS = 3  # highest power of each stop: odd ones for symmetric loops, the even one for one-sided forces
-KNEES = (0.01, 0.05, 0.25)  # of the curves v / (|v| + knee), over the largest speed: from dry friction to a smooth bend
-FEATURES = 5 + STOPS * POWERS + 4 + 2 * len(KNEES)  # number of features in `LearnedForce.step`
 EXTENSION = 0.5  # largest extension of a signal beyond its range, over half the range
 FIT_EXTENSION = 5.0  # the same during the fit, because the refit's run may be a poor guess of the range
 # ridge strengths tried, relative to the mean square response to a force of unit size
@@ -48,12 +47,39 @@ START_SHARES = (1.0, 0.3, 0.0)  # fractions of the linear solution from which a 
 SAME_SIGNAL = 0.99  # correlation with z or dz/dt above which an input counts as that signal and scales nothing
 
 
-class LearnedForce(Law):
-    """A force of z, dz/dt and memory, linear in its weights; the scales of its features are fixed."""
+class _Learned(Law):
+    """The common part of learned forces: linear in their weights, with features of fixed scales."""
 
     id = "learned"
-    equation = "w = sum_j c_j phi_j(z, dz/dt, stops of z)"
     source = "Kennedy & O'Hagan (2001), J. R. Statist. Soc. B 63(3)"
+    strength: ClassVar[tuple[str, ...]] = ("c",)
+    factor: ClassVar[str] = ""  # input that scales a part of the force
+    features: ClassVar[int]  # their number
+    listed = False
+
+    def weigh(self, phi: Sequence[Any], p: Any, u: Any) -> Any:
+        """Sum the features with their weights."""
+        w = sum(p["c"][j] * f for j, f in enumerate(phi))
+        if self.factor and u is not None:
+            scale = (_saturate(u[self.factor], p["u_low"], p["u_high"], p["u_room"]) - p["u_0"]) / p["u_s"]
+            w += scale * sum(p["c"][len(phi) + j] * f for j, f in enumerate(phi))
+        return w
+
+    def parameters(self) -> dict[str, Parameter]:
+        """Return the weights with their prior, free if the recordings move them, and the fixed scales."""
+        given = {**dict.fromkeys(self.units, 1.0), **self.defaults, "c": 0.0, **self.values}
+        shape = (self.features * (2 if self.factor else 1),)
+        c, std = (np.broadcast_to(np.asarray(given[name], dtype=float), shape) for name in ("c", "std"))
+        felt = std > 0
+        weights = Parameter(np.where(felt, c, 0.0), "w", fixed=~felt, prior=(0.0, np.where(felt, std, 1.0)))
+        scales = {k: unit for k, unit in self.units.items() if k not in ("c", "std")}
+        return {"c": weights, **{k: Parameter(float(given[k]), unit, fixed=True) for k, unit in scales.items()}}
+
+
+class LearnedForce(_Learned):
+    """A force of z, dz/dt and memory."""
+
+    equation = "w = sum_j c_j phi_j(z, dz/dt, stops of z)"
     sentence = "a learned force of the local coordinate, its rate and its turning points"
     # weights with their prior deviations; centre, reach and half the range of z, largest speed, mean and deviation of
     # the scaling input; ends of the ranges seen, and the extension beyond them
@@ -65,9 +91,8 @@ class LearnedForce(Law):
     strength: ClassVar[tuple[str, ...]] = ("c",)
     defaults: ClassVar[Mapping[str, Any]] = {"z_0": 0.0, "u_0": 0.0, "z_low": -1.0, "v_low": -1.0, "u_low": -1.0}
     places = ("parallel", "series")
-    factor: ClassVar[str] = ""  # input that scales a part of the force
+    features = 5 + STOPS * POWERS + 4 + 2 * len(KNEES)
     follows = memory = STOPS
-    listed = False
 
     @classmethod
     def reads(cls) -> set[str]:
@@ -87,21 +112,7 @@ class LearnedForce(Law):
         for knee in KNEES:
             curve = v / (ca.fabs(v) + knee)
             phi += [curve, x * curve]
-        w = sum(p["c"][j] * f for j, f in enumerate(phi))
-        if self.factor and u is not None:
-            scale = (_saturate(u[self.factor], p["u_low"], p["u_high"], p["u_room"]) - p["u_0"]) / p["u_s"]
-            w += scale * sum(p["c"][len(phi) + j] * f for j, f in enumerate(phi))
-        return w, ca.vertcat(*following)
-
-    def parameters(self) -> dict[str, Parameter]:
-        """Return the weights with their prior, free if the recordings move them, and the fixed scales."""
-        given = {**dict.fromkeys(self.units, 1.0), **self.defaults, "c": 0.0, **self.values}
-        shape = (FEATURES * (2 if self.factor else 1),)
-        c, std = (np.broadcast_to(np.asarray(given[name], dtype=float), shape) for name in ("c", "std"))
-        felt = std > 0
-        weights = Parameter(np.where(felt, c, 0.0), "w", fixed=~felt, prior=(0.0, np.where(felt, std, 1.0)))
-        scales = {k: unit for k, unit in self.units.items() if k not in ("c", "std")}
-        return {"c": weights, **{k: Parameter(float(given[k]), unit, fixed=True) for k, unit in scales.items()}}
+        return self.weigh(phi, p, u), ca.vertcat(*following)
 
     def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
         """Generate the scales of the signals along recordings; |z| bends at zero if z takes both signs."""
@@ -110,6 +121,36 @@ class LearnedForce(Law):
         speed = local.speed if np.any(local.dz) else 1.0
         scales = {"z_0": centre, "z_s": max(local.high - centre, centre - local.low), "z_h": local.half, "v_s": speed}
         yield {**scales, **_ranges(FIT_EXTENSION, z=local.z, v=local.dz)}
+
+
+class LearnedForceOfSpeed(_Learned):
+    """A force of the speed alone, at a port that has no position."""
+
+    equation = "w = sum_j c_j phi_j(dz/dt)"
+    sentence = "a learned force of the speed"
+    units: ClassVar[Mapping[str, str]] = {
+        name: unit for name, unit in LearnedForce.units.items() if not name.startswith("z_")
+    }
+    strength: ClassVar[tuple[str, ...]] = ("c",)
+    defaults: ClassVar[Mapping[str, Any]] = {"u_0": 0.0, "v_low": -1.0, "u_low": -1.0}
+    features = 1 + SPEED_CURVES
+
+    def force(self, dz: Any, p: Any) -> Any:
+        """Compute the force."""
+        return self.force_with(dz, p, None)
+
+    def force_with(self, dz: Any, p: Any, u: Any) -> Any:
+        """Compute the force of which an input scales a part."""
+        v = _saturate(dz, p["v_low"], p["v_high"], p["v_room"]) / p["v_s"]
+        return self.weigh([1.0, *speed_curves(v)], p, u)
+
+    def shapes(self, local: Local) -> Iterator[dict[str, Any]]:
+        """Generate the scale and the range of the speed along recordings."""
+        yield {"v_s": (1 + EXTENSION) * float(np.max(np.abs(local.dz))), **_ranges(EXTENSION, v=local.dz)}
+
+    def why_not(self, local: Local) -> str:
+        """Say that the port has a position; `LearnedForce` is for those."""
+        return "" if local.is_speed else "the port has a position"
 
 
 def _saturate(x: Any, low: Any, high: Any, room: Any) -> Any:
@@ -128,18 +169,20 @@ def _ranges(room: float, **signals: np.ndarray) -> dict[str, float]:
 
 
 @functools.cache  # the same class for the same input
-def learned_force(factor: str = "") -> type[LearnedForce]:
-    """Make the class of learned forces; the input `factor`, if any, scales a part of the force."""
+def learned_force(factor: str = "", of_speed: bool = False) -> type[_Learned]:
+    """Make the class of learned forces, or of those of a speed; the input `factor`, if any, scales a part of it."""
+    kind = LearnedForceOfSpeed if of_speed else LearnedForce
     if not factor:
-        return LearnedForce
+        return kind
     own = {
         "factor": factor,
         "form": f"scaled by {factor}",
-        "equation": f"w = sum_j (c_j + d_j {factor}~) phi_j(z, dz/dt, stops of z)",
-        "sentence": f"{LearnedForce.sentence}; {factor} scales a part of it",
-        "__doc__": LearnedForce.__doc__,
+        "equation": kind.equation.replace("c_j phi_j", f"(c_j + d_j {factor}~) phi_j"),
+        "sentence": f"{kind.sentence}; {factor} scales a part of it",
+        "__doc__": kind.__doc__,
+        **({"force": LearnedForceOfSpeed.force_with} if of_speed else {}),
     }
-    return type(f"LearnedForceScaledBy_{factor}", (LearnedForce,), own)
+    return type(f"{kind.__name__}ScaledBy_{factor}", (kind,), own)
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,7 +193,7 @@ class Start:
     """
 
     port: str
-    law: LearnedForce
+    law: _Learned
     share: float
 
 
@@ -158,14 +201,14 @@ def linear_starts(bench: Workbench, base: Fitted, port_names: Sequence[str]) -> 
     """Solve the linear problem at each port, also with each input that may scale the force; best first."""
     bench = bench.balanced(base)
     probe, runs = linearise_runs(bench, base)
-    rest = Remainder.of(bench, probe, runs, (LearnedForce,))
+    rest = Remainder.of(bench, probe, runs, (LearnedForce, LearnedForceOfSpeed))
     samples = sum(len(r) - r.skip for r in bench.recordings) * len(bench.scale)
     out = []
     for task in rest.tasks:
         if task.port.name not in port_names:
             continue
-        shape = task.pairs[0][1][0]
-        forces = unit_forces(LearnedForce(), task.part, [shape]).reshape(len(task.part.z), -1)
+        law, (shape,) = task.pairs[0]
+        forces = unit_forces(law, task.part, [shape]).reshape(len(task.part.z), -1)
         for factor in ("", *(name for name in task.local.inputs if _may_scale(task, name))):
             out.append(_solve_weights(rest, task, forces, shape, factor, samples / len(rest.left)))
     return sorted(out, key=lambda s: -s.share)
@@ -187,7 +230,7 @@ def _solve_weights(
 
     `repeated` is the number of scored samples per sample used here; the prior counts once.
     """
-    scales, columns = dict(shape), forces.copy()
+    scales, columns, kind = dict(shape), forces.copy(), learned_force(factor, task.port.is_speed)
     if factor:
         u, whole = task.part.inputs[factor], task.local.inputs[factor]
         scales |= {"u_0": float(np.mean(whole)), "u_s": float(np.std(whole)), **_ranges(EXTENSION, u=whole)}
@@ -195,13 +238,13 @@ def _solve_weights(
     phi, size = rest.response(task.index, columns)
     felt, weights, std = lengths(phi) > 0, np.zeros(len(size)), np.zeros(len(size))
     if not np.any(felt):
-        return Start(task.port.name, learned_force(factor)({**scales, "std": 0.0}), 0.0)
+        return Start(task.port.name, kind({**scales, "std": 0.0}), 0.0)
     phi, unit = phi[:, felt], float(np.mean(lengths(phi[:, felt]) ** 2))
     rests = {ridge: held_out_rest(phi, rest.left, rest.odd, unit * ridge) for ridge in WEIGHT_RIDGES}
     wrong, ridge = min((float(np.sum(e**2)), ridge) for ridge, e in rests.items())
     weights[felt] = -ridge_solution(phi, rest.left, unit * ridge) / size[felt]
     std[felt] = 1 / (size[felt] * np.sqrt(unit * ridge * repeated))
-    law = learned_force(factor)({**scales, "c": weights, "std": std})
+    law = kind({**scales, "c": weights, "std": std})
     return Start(task.port.name, law, 1 - wrong / max(float(rest.left @ rest.left), 1e-300))
 
 
@@ -238,10 +281,11 @@ def refit_learned(bench: Workbench, found: Fitted) -> Fitted:
     InputError
         If the simulation diverges.
     """
-    placed = found.simulator
+    placed, element = found.simulator, found.simulator.elements[-1]
     fitted = bench.fit(placed, [found.values], states=found.initial, like=found)
     z, dz, _ = signals_along(bench, fitted)
-    seen = {f"{placed.elements[-1].prefix}{k}": np.array(v) for k, v in _ranges(EXTENSION, z=z, v=dz).items()}
+    ranges = _ranges(EXTENSION, z=z, v=dz)
+    seen = {f"{element.prefix}{k}": np.array(v) for k, v in ranges.items() if k in element.law.units}
     return replace(bench.rerun(fitted, {**fitted.values, **seen}), status=fitted.status)
 
 
@@ -312,9 +356,10 @@ class Learned:
         names = ", ".join(f"{display_name(n.law)} (off by {100 * n.error:.2g} %)" for n in self.nearest)
         near = f" The nearest laws are {names}." if names else ""
         z, dz = (f"{np.min(v):.4g} to {np.max(v):.4g}" for v in (self.z, self.dz))
+        where = f"the speed is from {dz}" if np.array_equal(self.z, self.dz) else f"z is from {z} and dz/dt from {dz}"
         return (
-            f"A learned force acts at {self.port}{by}. It holds where z is from {z} and dz/dt from {dz}, as in the "
-            f"training recordings, and is saturated beyond.{near}"
+            f"A learned force acts at {self.port}{by}. It holds where {where}, as in the training recordings, and is "
+            f"saturated beyond.{near}"
         )
 
     def to_dict(self) -> dict[str, Any]:
