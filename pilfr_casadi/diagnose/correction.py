@@ -297,19 +297,18 @@ def _polish(search: Search, trials: Sequence[Trial]) -> list[_Candidate]:
 def _learned_candidates(search: Search, base: Trial, taken: Collection[str] = ()) -> list[_Candidate]:
     """Make the candidate with the best learned force beside a trial at a port that is not taken, if there is one.
 
+    If an input scales a part of it, so that it has twice as many weights, the best one without that competes as well.
     After the deadline no further force is fitted.
     """
     if search.past_deadline:
         return []
-    free = (f for f in search.learned(base) if f.simulator.elements[-1].port not in taken)
-    found = next(free, None)
-    if found is None:
-        return []
-    try:
-        fitted = refit_learned(search.bench, found)
-    except InputError:  # it diverges
-        return []
-    return [_Candidate.of(search, base, fitted)]
+    free = [f for f in search.learned(base) if f.simulator.elements[-1].port not in taken]
+    plain = [f for f in free if not f.simulator.elements[-1].law.factor]
+    out = list[_Candidate]()
+    for found in dict.fromkeys((*free[:1], *plain[:1])):
+        with suppress(InputError):  # it diverges
+            out.append(_Candidate.of(search, base, refit_learned(search.bench, found)))
+    return out
 
 
 def uncompared_correction(search: Search, fitted: Fitted, floor: Floor | None = None) -> Correction:

@@ -80,7 +80,8 @@ class Posterior:
     """Probabilities of the answers."""
 
     best: Trial  # the likeliest hypothesis
-    named: float  # probability that the laws of the best hypothesis are the physics, given this hypothesis
+    # probability that the laws of the best hypothesis are the physics, given this hypothesis; at most that of one of them
+    named: float
     effects: tuple[LikelyEffect, ...]  # its laws, strongest first
     nothing: float  # probability of the simulator alone
 
@@ -188,8 +189,9 @@ def posterior(search: Hypotheses) -> Posterior:
         likeliest_names = fewer
     named = share_named(explainable_remainder(search, best), _odds_against(search, best, best.effects))
     found.sort(key=lambda e: -(_without(search, best, e) or search.root).mean_square)
-    effects = _as_physics(found, [_named_beside(search, best, e) for e in found])
-    answer = Posterior(best, named, effects, by_names.get(frozenset(), 0.0))
+    each = [_named_beside(search, best, e) for e in found]
+    effects = _as_physics(found, each)
+    answer = Posterior(best, min(named, max(each)), effects, by_names.get(frozenset(), 0.0))
     return answer.acting(search, best)
 
 
