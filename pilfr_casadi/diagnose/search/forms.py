@@ -148,19 +148,11 @@ class Forms(Hypotheses):
         return best.with_added(*added) if len(added) == 1 and parent.key < best.key else None
 
     def refine_added(self, parent: Trial) -> None:
-        """Fit the best law of a move in related forms, and where its strength varies, with other profiles of that."""
+        """Fit the best law of a move in related forms; then schedule the strength of the best law that allows it."""
         best = self._best_with_one_more(parent)
         if best is not None:
             self.fit_related_forms(best)
-        self._fit_profiles(parent)
-
-    def vary_added(self, move: Move) -> None:
-        """Schedule the strength of the best law of a move that allows it."""
-        self._vary_strength(move)
-        self._fit_profiles(move.parent)
-
-    def _fit_profiles(self, parent: Trial) -> None:
-        """Fit the best law beside a hypothesis, if its strength varies, with other profiles and as constant laws."""
+        self._vary_strength()
         best = self._best_with_one_more(parent)
         by = (best.law.scheduled_by or best.law.scaled_by) if best is not None else ""
         if best is not None and by and "parallel" in best.law.places and self.may_go_on():
@@ -181,13 +173,13 @@ class Forms(Hypotheses):
                 kinds.append(kind)
         self.fit_forms(trial, kinds)
 
-    def _vary_strength(self, move: Move) -> None:
-        """Let the strength of the likeliest law of a move that may vary do so, with every signal.
+    def _vary_strength(self) -> None:
+        """Let the strength of the likeliest law of the last move that may vary do so, with every signal.
 
         With the signal found, its other forms may be the physics. A linear law was screened with every signal.
         """
         may_vary = [kind for kind in SCALABLE if kind.id not in LINEAR]
-        added = [t for t in move.trials if constant(type(t.law)) in may_vary]
+        added = [t for t in self.moves[-1].trials if constant(type(t.law)) in may_vary]
         kept = [self.memo[t.key].with_added(t.pair) for t in added]  # perhaps found before in another order
         # a force that varies with a signal is in no flexible force, so that its rest may have passed for noise
         if not kept or not self.can_improve(self.best, self.least_floor) or not self.may_go_on():

@@ -83,7 +83,6 @@ class Search(Forms):
         A parameter that varies can imitate many laws. So hypotheses with one are a basis for more only if `varied`.
         The first law is fitted even if the preparation took all the time.
         """
-        first = len(self.moves)
         while (
             self.can_improve(self.best)
             and len((parent := self._parent(varied)).effects) < self.most_effects
@@ -104,26 +103,11 @@ class Search(Forms):
                 self.exchange()
             if len(self._parent(varied).laws) <= len(parent.laws):  # no added law is worth its prior
                 break
-        self._vary_strengths(varied, first)
         if self.most_effects > 1 and TWO not in self.times and self.can_improve(self.best) and self.may_go_on():
             best = self.best
             self.add_two()
             if self.best is not best:
                 self._grow(varied)
-
-    def _vary_strengths(self, varied: bool, first: int) -> None:
-        """Let the strengths of the laws vary that were added from a move on; if that is better, add further effects.
-
-        A further law often explains more, and in less time: then nothing has to vary.
-        """
-        best = self.best
-        with self.stage("choice"):
-            for move in [m for m in self.moves[first:] if m.parent.key < best.key]:
-                self.vary_added(move)
-            if self.best is not best:
-                self.estimate_noise()
-        if self.best is not best:
-            self._grow(varied)
 
     def _parent(self, varied: bool) -> Trial:
         """Return the best hypothesis, or the best one in which no parameter varies."""
