@@ -145,7 +145,8 @@ def find_named_correction(search: Search, answer: Posterior) -> tuple[Correction
     if not validated:
         stays = candidates[0].base
         return replace(uncompared_correction(search, stays.fitted), closest=stays), stays.fitted
-    more = [t for t in _likely_hypotheses(search) if sure <= t.names and all(t.key != c.base.key for c in candidates)]
+    known = {c.base.names for c in candidates}  # of these laws, the forms are chosen
+    more = [t for t in _likely_hypotheses(search) if sure <= t.names and t.names not in known]
     validated = _grow(search, _cross_validate(search, _polish(search, more), validated), sure)
     chosen = _choose(validated, sure)[0].base
     learned = _learned_candidates(search, search.memo[(chosen if chosen.laws else best).key])

@@ -86,7 +86,7 @@ def test_without_blocks_the_smallest_error_decides() -> None:
 def test_a_law_is_compared_in_its_likeliest_form() -> None:
     """A correction may have another form, such as one with more values."""
     trials = {
-        name: SimpleNamespace(names=frozenset({("wall", law)}), evidence=evidence)
+        name: SimpleNamespace(names=frozenset({("wall", law)}), evidence=evidence, mean_square=0.01)
         for name, law, evidence in (("plain", "friction", 17), ("curved", "friction", 13), ("other", "damping", 13))
     }
     bench = SimpleNamespace(simulator=SimpleNamespace(output_names=("y",)))
@@ -95,3 +95,5 @@ def test_a_law_is_compared_in_its_likeliest_form() -> None:
     assert not indistinguishable(search, trials["curved"], own)  # type: ignore[arg-type]
     trials["other"].evidence = 17
     assert list(indistinguishable(search, trials["curved"], own)) == [("wall", "damping")]  # type: ignore[arg-type]
+    trials["nothing"] = SimpleNamespace(names=frozenset(), evidence=10, mean_square=0.0105)
+    assert not indistinguishable(search, trials["curved"], own)  # type: ignore[arg-type]
