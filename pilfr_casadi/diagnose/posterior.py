@@ -80,7 +80,7 @@ class Posterior:
     """Probabilities of the answers."""
 
     best: Trial  # the likeliest hypothesis
-    # probability that the laws of the best hypothesis are the physics, given it; at most that of one of them
+    # probability that the laws of the best hypothesis are the physics, given it; at most that of the surest of them
     named: float
     effects: tuple[LikelyEffect, ...]  # its laws, strongest first
     nothing: float  # probability of the simulator alone

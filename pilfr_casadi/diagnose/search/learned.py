@@ -223,7 +223,7 @@ def _may_scale(task: Task, name: str) -> bool:
     return not any(abs(np.corrcoef(u, v)[0, 1]) > SAME_SIGNAL for v in own)
 
 
-def _solve_weights(rest: Remainder, task: Task, law: Law, shape: Mapping[str, Any], factor: str, samples: int) -> Start:
+def _solve_weights(rest: Remainder, task: Task, law: Law, shape: dict[str, Any], factor: str, samples: int) -> Start:
     """Fit the weights to the projected residual by ridge regression; its strength is chosen on held-out blocks.
 
     `samples` is the number of scored samples, more than are used here; the prior counts once.
