@@ -80,7 +80,7 @@ class Posterior:
     """Probabilities of the answers."""
 
     best: Trial  # the likeliest hypothesis
-    # probability that the laws of the best hypothesis are the physics, given it; at most that of one of them
+    # probability that the laws of the best hypothesis are the physics, given it; at most that of the surest of them
     named: float
     effects: tuple[LikelyEffect, ...]  # its laws, strongest first
     nothing: float  # probability of the simulator alone
@@ -294,10 +294,12 @@ def indistinguishable(search: Hypotheses, best: Trial, element: Placed) -> dict[
     rest, out = best.names - {own}, dict[Name, Trial]()
     forms = likeliest_forms((best, *search.memo.values()), search.evidence)
     least = next(search.evidence(t) for t in forms if t.names == best.names) - INDISTINGUISHABLE_NATS
-    # few samples count where all models are wrong, so that one which explains nothing may be about as likely
+    # few samples count where all models are wrong, so that one which explains nothing may be about as likely; where the
+    # effect is small, a law that explains half as much is another explanation
     nothing = min((t.mean_square for t in hypotheses_named(search, rest)), default=np.inf)
+    most = max(nothing / BETTER_RATIO**2, (nothing * best.mean_square) ** 0.5)
     every = [port_name(SENSOR, name) for name in search.bench.simulator.output_names]
-    for t in (t for t in forms if search.evidence(t) >= least and BETTER_RATIO**2 * t.mean_square <= nothing):
+    for t in (t for t in forms if search.evidence(t) >= least and t.mean_square <= most):
         other = t.names - rest
         if not rest <= t.names or own in other or not other:
             continue

@@ -232,7 +232,7 @@ class SteepCurve(FreeCurve):
     form = "free with a steep end"
     equation = (
         "w = sum_i c_i (T_i(x) - T_i(x_0)) + a (L(x) - L(x_0)),  L(x) = exp(-(1 + s x) / e),  i = 2..9, "
-        "x = (z - z_m) / z_h,  x_0 = -z_m / z_h; along its tangents outside -1 <= x <= 1"
+        "x = (z - z_m) / z_h,  x_0 = -z_m / z_h; T_i along its tangents outside -1 <= x <= 1, L where 1 + s x < 0"
     )
     source = "Chen & Rincon-Mora (2006), IEEE Trans. Energy Convers. 21(2)"
     sentence = "a memoryless curve of a shape that no formula has, steep at one end"

@@ -7,7 +7,7 @@ import pytest
 
 from pilfr_casadi.diagnose.faults.offsets import Offset
 from pilfr_casadi.diagnose.fits.evidence import FORMULA_ERROR, STRAINED_ODDS, HeldOut, formula_tolerance, significance
-from pilfr_casadi.diagnose.posterior import explainable_remainder, posterior, share_left, share_named
+from pilfr_casadi.diagnose.posterior import explainable_remainder, indistinguishable, posterior, share_left, share_named
 from pilfr_casadi.diagnose.verdict import closest_hypothesis, judge
 from pilfr_casadi.laws import CoulombFriction, CubicStiffness, Delay, DirectionalFriction, QuadraticDrag
 
@@ -127,6 +127,15 @@ def test_the_same_law_at_two_ports_that_are_not_told_apart_keeps_its_confidence(
     found = posterior(search((trial(DRY), 0.0), (trial(there), behind)))
     assert list(found.effects[0].alike) == ([] if told_apart else [("b", "coulomb_friction")])
     assert found.sure == pytest.approx(SURE / (1 + np.exp(-behind)) if told_apart else SURE)
+
+
+@pytest.mark.parametrize(("left", "alike"), [(0.94, True), (0.99, False)])
+def test_a_small_effect_has_look_alikes_that_explain_about_as_much_as_it(search, trial, left, alike):
+    """The larger effect leaves 1 %; the smaller one removes 7 % of that, and so does the other law there, or hardly."""
+    small, other = ("b", CubicStiffness), ("b", QuadraticDrag)
+    best = trial(DRY, small, left=0.0093)
+    found = search(trial(DRY, left=0.01), (best, 0.0), (trial(DRY, other, left=0.01 * left), 1.0))
+    assert list(indistinguishable(found, best, best.laws[1])) == [("b", "quadratic_drag")] * alike
 
 
 def test_two_forms_of_a_law_are_one_answer(search, trial):

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from pilfr_casadi import Diagnosis, Parameter, Port, Recording, Simulator, diagnose
+from pilfr_casadi.diagnose import Workbench
+from pilfr_casadi.diagnose.search.learned import LearnedForce, LearnedForceOfSpeed, linear_starts
 from pilfr_casadi.laws import CATALOGUE, Clearance, CoulombFriction, CubicDamping, PowerWithGain, StribeckFriction
 from pilfr_casadi.simulators import Named
 
@@ -149,3 +151,13 @@ def test_a_learned_force_of_the_speed_is_saturated_beyond_the_recordings(braked:
     law = braked.corrected.elements[-1].law
     far = [float(law.force(np.array(w), Named("p", law.values))) for w in (-1e6, -1e4, 1e4, 1e6)]
     assert far[0] == pytest.approx(far[1], rel=0.05) and far[2] == pytest.approx(far[3], rel=0.05)
+
+
+def test_a_force_is_learned_where_no_unit_tells_a_speed_from_another_quantity() -> None:
+    """Such a port admits forces of a position as well."""
+    plain = drive()
+    (port,) = (port for port in plain.all_ports() if not port.series)
+    assert port.is_speed and port.admits(LearnedForce) and port.admits(LearnedForceOfSpeed)
+    bench = Workbench.of(plain, [measured(0)], "zero")
+    starts = linear_starts(bench, bench.fit(plain), [port.name])
+    assert {start.law.factor for start in starts} == {"", "i"} and starts[0].share > 0.5

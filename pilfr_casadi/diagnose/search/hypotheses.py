@@ -94,9 +94,8 @@ class Hypotheses:
     count: float = FEWEST  # samples of the best residual over its correlation time
     # mean squares of the mismatch (n_y,) for `tolerance`; None: those of the refit
     mismatch2: np.ndarray | None = None
-    _least: tuple[tuple[object, ...], float] | None = (
-        None  # the objects that `_least_tolerant` was computed from, and its value
-    )
+    # the objects that `_least_tolerant` was computed from, and its value
+    _least: tuple[tuple[object, ...], float] | None = None
 
     @cached_property
     def fits(self) -> Trials:

@@ -207,10 +207,10 @@ def linear_starts(bench: Workbench, base: Fitted, port_names: Sequence[str]) -> 
     for task in rest.tasks:
         if task.port.name not in port_names:
             continue
-        law, (shape,) = task.pairs[0]
-        forces = unit_forces(law, task.part, [shape]).reshape(len(task.part.z), -1)
         for factor in ("", *(name for name in task.local.inputs if _may_scale(task, name))):
-            out.append(_solve_weights(rest, task, forces, shape, factor, samples / len(rest.left)))
+            # where z may be a speed or another quantity, both kinds are admitted
+            both = (_solve_weights(rest, task, law, shape, factor, samples) for law, (shape,) in task.pairs)
+            out.append(max(both, key=lambda s: s.share))
     return sorted(out, key=lambda s: -s.share)
 
 
@@ -223,18 +223,17 @@ def _may_scale(task: Task, name: str) -> bool:
     return not any(abs(np.corrcoef(u, v)[0, 1]) > SAME_SIGNAL for v in own)
 
 
-def _solve_weights(
-    rest: Remainder, task: Task, forces: np.ndarray, shape: Mapping[str, Any], factor: str, repeated: float
-) -> Start:
+def _solve_weights(rest: Remainder, task: Task, law: Law, shape: dict[str, Any], factor: str, samples: int) -> Start:
     """Fit the weights to the projected residual by ridge regression; its strength is chosen on held-out blocks.
 
-    `repeated` is the number of scored samples per sample used here; the prior counts once.
+    `samples` is the number of scored samples, more than are used here; the prior counts once.
     """
-    scales, columns, kind = dict(shape), forces.copy(), learned_force(factor, task.port.is_speed)
+    scales, kind = dict(shape), learned_force(factor, isinstance(law, LearnedForceOfSpeed))
+    columns = unit_forces(law, task.part, [shape]).reshape(len(task.part.z), -1)
     if factor:
         u, whole = task.part.inputs[factor], task.local.inputs[factor]
         scales |= {"u_0": float(np.mean(whole)), "u_s": float(np.std(whole)), **_ranges(EXTENSION, u=whole)}
-        columns = np.hstack([forces, forces * ((u - scales["u_0"]) / scales["u_s"])[:, None]])
+        columns = np.hstack([columns, columns * ((u - scales["u_0"]) / scales["u_s"])[:, None]])
     phi, size = rest.response(task.index, columns)
     felt, weights, std = lengths(phi) > 0, np.zeros(len(size)), np.zeros(len(size))
     if not np.any(felt):
@@ -243,9 +242,9 @@ def _solve_weights(
     rests = {ridge: held_out_rest(phi, rest.left, rest.odd, unit * ridge) for ridge in WEIGHT_RIDGES}
     wrong, ridge = min((float(np.sum(e**2)), ridge) for ridge, e in rests.items())
     weights[felt] = -ridge_solution(phi, rest.left, unit * ridge) / size[felt]
-    std[felt] = 1 / (size[felt] * np.sqrt(unit * ridge * repeated))
-    law = kind({**scales, "c": weights, "std": std})
-    return Start(task.port.name, law, 1 - wrong / max(float(rest.left @ rest.left), 1e-300))
+    std[felt] = 1 / (size[felt] * np.sqrt(unit * ridge * samples / len(rest.left)))
+    found = kind({**scales, "c": weights, "std": std})
+    return Start(task.port.name, found, 1 - wrong / max(float(rest.left @ rest.left), 1e-300))
 
 
 def learn_forces(bench: Workbench, base: Fitted, port_names: Sequence[str], workers: int = 1) -> list[Fitted]:
