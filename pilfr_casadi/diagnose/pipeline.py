@@ -264,8 +264,10 @@ def _conclude_named(
     search: Search, judged: _Judgement, elsewhere: Sequence[Gate], correction: Correction, fitted: Fitted
 ) -> Conclusion:
     """State the named effects, and the offsets beside them."""
-    sentence = f"{judged.verdict.sentence} {correction.sentence}" if correction.learned else judged.verdict.sentence
-    notes = (*judged.gates, *elsewhere, *list_offsets(search.added_laws(fitted), fitted.values))
+    added, named = search.added_laws(fitted), {e.name for e in judged.answer.effects}
+    more = correction.learned or any(e.law.listed and e.name not in named for e in added)
+    sentence = f"{judged.verdict.sentence} {correction.sentence}" if more else judged.verdict.sentence
+    notes = (*judged.gates, *elsewhere, *list_offsets(added, fitted.values))
     return Conclusion(Verdict(judged.kind, sentence), notes, fitted, correction, judged.answer.effects)
 
 

@@ -356,7 +356,7 @@ class ResultText:
         return ["further blind spots of these recordings:", *further, *more] if further else []
 
     def _nameless_lines(self) -> list[str]:
-        """List the laws of a correction without a sure name, with their values."""
+        """List the laws of the corrected simulator without a sure name, with their values."""
         lines = list[str]()
         for law in self.nameless_laws:
             lines += [f"in the correction, without a sure name: {law.name}"]
@@ -367,10 +367,11 @@ class ResultText:
 
     @property
     def nameless_laws(self) -> list[NamelessLaw]:
-        """The laws of a correction without a sure name."""
+        """The laws of the corrected simulator without a sure name; they may stand beside named effects."""
         out, parameters = list[NamelessLaw](), self.corrected.readable_parameters()
-        for e in self.added if self.nameless is not None else ():
-            if e.law.listed:
+        named = {(effect.port, effect.law) for effect in self.effects}
+        for e in self.added:
+            if e.law.listed and e.name not in named:
                 own = {name: parameters[f"{e.prefix}{name}"] for name in e.law.parameters()}
                 free = {name: p for name, p in own.items() if not np.all(p.fixed)}
                 doubt, alike = self._acts_with_motion(e) * HELPS_MOTION, listed(self._alike(e), MOST_PRINTED)

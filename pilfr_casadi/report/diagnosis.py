@@ -139,7 +139,8 @@ def _result(d: Diagnosis, actions: Sequence[Action | None]) -> list[Block]:
     elif d.verdict == "recording-fault":
         out.append(Text("Correct the recordings before you look for missing physics; see the checks above."))
     if d.correction and (d.nameless or d.learned):
-        out += [Text(d.correction.sentence), *tables.nameless_blocks(d)]
+        out.append(Text(d.correction.sentence))
+    out += tables.nameless_blocks(d)
     out += [Text(learned.sentence) for learned in d.learned]
     return [*out, tables.error_table(d), *map(Text, d.warnings())]
 

@@ -209,7 +209,8 @@ def nameless_blocks(diagnosis: Diagnosis) -> list[Block]:
     """Describe the laws of a correction without a sure name: equations, values, and the laws that explain as much."""
     out = list[Block]()
     for law in diagnosis.nameless_laws:
-        out += [Text(f"{capitalise(law.name)}:"), Code(law.equation)]
+        name = f"Also in the correction, without a sure name: {law.name}" if diagnosis.effects else capitalise(law.name)
+        out += [Text(f"{name}:"), Code(law.equation)]
         values = {name: (", ".join(map(number_text, np.ravel(p.value))), p.unit) for name, p in law.free.items()}
         out += _value_table(values)
         out += [Text(f"{capitalise(law.doubt)}.")] if law.doubt else []

@@ -70,6 +70,18 @@ def test_the_verbs_tell_what_the_diagnosis_told(diagnosed):
 
 
 @pytest.mark.usefixtures("blank_figures")
+def test_further_laws_of_the_corrected_simulator_are_told_beside_the_named_ones(diagnosed, tmp_path):
+    found, _, _ = diagnosed
+    corrected = found.corrected.with_element("ground", CoulombFriction().at({"F_c": 0.25, "v_0": 2e-3}))
+    more = replace(found, corrected=corrected)
+    assert [e.law for e in more.effects] == ["cubic_stiffness"]
+    told = str(more).split("in the correction, without a sure name: Coulomb friction (smooth) at ground")[1]
+    assert "F_c = 0.25" in told and "without a sure name" not in str(found)
+    page = diagnosis_report(more, tmp_path).read_text()
+    assert "Also in the correction, without a sure name: Coulomb friction (smooth) at ground:" in page
+
+
+@pytest.mark.usefixtures("blank_figures")
 def test_the_noise_is_told_relative_to_each_recording(diagnosed, tmp_path):
     found, test, _ = diagnosed
     noise = found.floor["test"]["nrmse"]
