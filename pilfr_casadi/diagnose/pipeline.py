@@ -184,7 +184,7 @@ def conclude(search: Search, gates: Sequence[Gate]) -> Conclusion:
             return found
     if judged.kind == "missing-physics":
         correction, fitted = find_named_correction(search, answer)
-        judged, elsewhere = _weigh_names(search, answer, correction, gates, finished)
+        judged, elsewhere = _weigh_names(search, answer.as_fitted(fitted), correction, gates, finished)
         if judged.kind == "missing-physics":
             return _conclude_named(search, judged, elsewhere, correction, fitted)
     if judged.kind == "unexplained" and finished:

@@ -100,6 +100,11 @@ class Posterior:
         ratio = named / max(self.named, 1e-300)
         return replace(self, named=named, effects=tuple(e.times(ratio) for e in effects))
 
+    def as_fitted(self, fitted: Fitted) -> Posterior:
+        """Take the effects' laws as the corrected simulator has them, perhaps in another form."""
+        there = {e.name: e for e in fitted.simulator.elements}
+        return replace(self, effects=tuple(replace(e, element=there.get(e.name, e.element)) for e in self.effects))
+
     def acting(self, search: Hypotheses, trial: Trial) -> Posterior:
         """Weigh the effects by the probability that their strengths are not zero in a fit of the same laws."""
         acts = {e.name: _probability_not_zero(search, trial, e) for e in trial.effects}

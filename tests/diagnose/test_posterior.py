@@ -287,6 +287,13 @@ def test_a_law_that_degenerates_at_its_values_names_nothing_however_well_it_foll
     assert posterior(search(trial(CUBIC))).named < 0.5
 
 
+def test_effects_are_said_in_the_form_that_corrects(search, trial):
+    plain, other = trial(DRY, left=1e-4), trial(("a", DirectionalFriction), left=1e-4)
+    found = posterior(search(plain, other))
+    assert [e.element.law.form for e in found.effects] == ["smooth"]
+    assert "directional" in found.as_fitted(other.fitted).effects[0].words
+
+
 @pytest.mark.parametrize(("port", "sure"), [("a", False), ("b", True)])
 def test_a_small_effect_is_not_surer_than_a_large_one_at_its_port(search, trial, monkeypatch, port, sure):
     """Beside a wrong law, it only corrects that."""
