@@ -36,6 +36,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from ..._base import InputError, side_by_side
+from ...data import group_by_input
 from ...identify import solve_within_bounds
 from ...laws import Law
 from ...optimise import GaussNewton, Problem, Status
@@ -531,15 +532,21 @@ def blocks_of(bench: Workbench) -> list[np.ndarray]:
 
 
 def held_out_errors(bench: Workbench, fitted: Fitted, workers: int = 1) -> HeldOut:
-    """Refit without each fold of blocks and without the second halves; return the errors on the omitted parts.
+    """Refit without each fold of blocks and without second halves; return the errors on the omitted parts.
 
-    They are infinite if the run diverges or the time is over.
+    Recordings of other inputs lose other blocks, and their second halves in turn: courses may be alike, such as
+    discharges from full to empty, so that the same states would be left out of all. The errors are infinite if the run
+    diverges or the time is over.
     """
-    blocks = blocks_of(bench)
-    folds = [[(b >= 0) & (b % FOLDS == fold) for b in blocks] for fold in range(FOLDS)]
-    later = [b >= FOLDS * ROUNDS // 2 for b in blocks]
-    *squares, second = side_by_side(lambda left: _sum_of_squares(bench, fitted, left), [*folds, later], workers)
-    scored, ahead = (max(sum(int(np.sum(mask)) for mask in masks), 1) for masks in ([b >= 0 for b in blocks], later))
+    blocks, groups = blocks_of(bench), group_by_input(bench.recordings)
+    group = {k: g for g, members in enumerate(groups) for k in members}
+    shift = {k: g * FOLDS // min(len(groups), FOLDS) for k, g in group.items()}
+    folds = [[(b >= 0) & ((b + shift[k]) % FOLDS == fold) for k, b in enumerate(blocks)] for fold in range(FOLDS)]
+    parts, half = min(len(groups), 2), FOLDS * ROUNDS // 2
+    later = [[(b >= half) & (group[k] % parts == part) for k, b in enumerate(blocks)] for part in range(parts)]
+    found = side_by_side(lambda left: _sum_of_squares(bench, fitted, left), [*folds, *later], workers)
+    squares, second = found[:FOLDS], np.sum(found[FOLDS:], axis=0)
+    scored, ahead = (max(sum(int(np.sum(b >= first)) for b in blocks), 1) for first in (0, half))
     of_blocks = np.sum(squares, axis=0)
     both = np.sum(of_blocks, axis=0) / scored, np.sum(second, axis=0) / ahead
     pooled = bench.pool(both[0]), bench.pool(both[1])

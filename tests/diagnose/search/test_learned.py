@@ -14,7 +14,8 @@ from diagnosis_example import LAWS, NOISE, recorded, rig
 
 import pilfr_casadi as pilfr
 from pilfr_casadi.diagnose import Effect, Workbench
-from pilfr_casadi.diagnose.fits.evidence import held_out_errors
+from pilfr_casadi.diagnose.fits import evidence
+from pilfr_casadi.diagnose.fits.evidence import _sum_of_squares, held_out_errors
 from pilfr_casadi.diagnose.search.learned import LearnedForce, learn_forces, nearest_laws
 from pilfr_casadi.laws import Backlash, CubicStiffness, Law, Local, hysteresis_layer
 from pilfr_casadi.models import play
@@ -141,6 +142,26 @@ def test_held_out_blocks_tell_a_better_simulator():
     assert NOISE**2 < after.mean_square < 0.25 * before.mean_square
     exact = Workbench.of(true, bench.recordings, "zero")
     assert held_out_errors(exact, exact.fit(true)).mean_square ** 0.5 == pytest.approx(NOISE, rel=0.1)
+
+
+def test_recordings_of_one_course_lose_different_blocks_unless_their_inputs_are_the_same(monkeypatch):
+    """Two discharges would lose the same charges, so that any curve of the charge would extrapolate."""
+    left = []
+
+    def note(bench, fitted, masks):
+        left.append(masks)
+        return _sum_of_squares(bench, fitted, masks)
+
+    monkeypatch.setattr(evidence, "_sum_of_squares", note)
+    first, second = recorded(rig(), 0, samples=400), recorded(rig(), 1, samples=400)
+    for recordings, together in (([first, second], False), ([first, first], True)):
+        left.clear()
+        bench = Workbench.of(rig(), recordings, "zero")
+        held_out_errors(bench, bench.fit(rig()))
+        assert all(np.array_equal(*masks) == together for masks in left)
+        assert not np.any([a & b for a, b in left[:4]]) or together
+        assert np.all(np.sum(left[:4], axis=0) == 1) and len(left) == (5 if together else 6)
+        assert np.array_equal(np.sum(left[4:], axis=0)[0], np.arange(400) >= 200)
 
 
 @pytest.mark.parametrize("seconds", [-1.0, 1e-3])
