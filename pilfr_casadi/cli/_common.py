@@ -278,7 +278,10 @@ class SimulatorOptions(DataOptions):
             raise InputError("No training recording was given; give the simulator file and at least one recording.")
         if self.source is not None and (self.inputs or self.outputs):
             where = f"; they go with {instead}" if instead else ""
-            raise InputError(f"--inputs and --outputs were given, but a simulator file has its own names{where}.")
+            raise InputError(
+                "--inputs and --outputs were given, but a simulator file has its own names; map columns to them with "
+                f"--column NAME=COLUMN{where}."
+            )
         check_given_once(self.recordings)
 
     def simulator_file(self) -> SimulatorFile:

@@ -222,7 +222,7 @@ def _places(rows: np.ndarray, part: np.ndarray) -> np.ndarray:
 def check_laws(laws: Sequence[type[Law] | str] | None) -> tuple[type[Law], ...]:
     """Return the classes of laws, by default the catalogue; a name stands for a class, or for all forms of an id."""
     if isinstance(laws, str):
-        laws = (laws,)
+        laws = [name.strip() for name in laws.split(",")]
     found: list[type[Law]] = []
     for law in laws or ():
         if isinstance(law, str):

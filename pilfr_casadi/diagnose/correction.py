@@ -146,7 +146,7 @@ def find_named_correction(search: Search, answer: Posterior) -> tuple[Correction
         stays = candidates[0].base
         return replace(uncompared_correction(search, stays.fitted), closest=stays), stays.fitted
     known = {c.base.names for c in candidates}  # of these laws, the forms are chosen
-    more = [t for t in _likely_hypotheses(search) if sure <= t.names and t.names not in known]
+    more = [t for t in _likely_hypotheses(search, sure) if t.names not in known]
     validated = _grow(search, _cross_validate(search, _polish(search, more), validated), sure)
     chosen = _choose(validated, sure)[0].base
     learned = _learned_candidates(search, search.memo[(chosen if chosen.laws else best).key])
@@ -275,9 +275,9 @@ def _sure_names(answer: Posterior) -> frozenset[Name]:
     return frozenset(e.name for e in answer.effects if e.confidence > SURE)
 
 
-def _likely_hypotheses(search: Search) -> list[Trial]:
-    """List the likeliest hypotheses with laws that may recur; of those not yet polished, only a few."""
-    recurring = [t for t in search.memo.values() if _may_recur(search, t)]
+def _likely_hypotheses(search: Search, sure: frozenset[Name] = frozenset()) -> list[Trial]:
+    """List the likeliest hypotheses with the sure names and laws that may recur; of those not polished, only a few."""
+    recurring = [t for t in search.memo.values() if sure <= t.names and _may_recur(search, t)]
     likely = sorted(likeliest(recurring, search.optimistic_evidence), key=search.evidence, reverse=True)
     return [t for i, t in enumerate(t for t in likely if t.laws) if t.thorough or i < FEW]
 

@@ -81,6 +81,16 @@ def test_further_laws_of_the_corrected_simulator_are_told_beside_the_named_ones(
     assert "Also in the correction, without a sure name: Coulomb friction (smooth) at ground:" in page
 
 
+def test_a_port_with_the_wrong_sign_is_told():
+    train = recorded(rig().with_element("ground", CoulombFriction().at({"F_c": 1.5, "v_0": 0.01})), 0, samples=400)
+    (port,) = rig().ports
+    for sign, told in ((-1.0, False), (1.0, True)):
+        given = replace(rig(430.0, 5.0), ports=(replace(port, into={"vel": sign}),))
+        found = pilfr.diagnose(given, train, laws="coulomb_friction, cubic_stiffness", workers=1)
+        assert [e.law for e in found.effects] == ["coulomb_friction"]
+        assert ("check the port's sign" in str(found)) == told
+
+
 @pytest.mark.usefixtures("blank_figures")
 def test_the_noise_is_told_relative_to_each_recording(diagnosed, tmp_path):
     found, test, _ = diagnosed
