@@ -23,6 +23,7 @@ _UNITS: dict[str, tuple[float, tuple[int, int, int, int, int, int]]] = {
         ("rpm", 2 * np.pi / 60, (0, 0, -1, 0, 0, 1)),
         ("A", 1.0, (0, 0, 0, 1, 0, 0)),
         ("K °C degC", 1.0, (0, 0, 0, 0, 1, 0)),
+        ("°F degF", 5 / 9, (0, 0, 0, 0, 1, 0)),
         ("N", 1.0, (1, 1, -2, 0, 0, 0)),
         ("Nm J", 1.0, (1, 2, -2, 0, 0, 0)),
         ("Ncm", 1e-2, (1, 2, -2, 0, 0, 0)),
@@ -50,10 +51,10 @@ _UNITS: dict[str, tuple[float, tuple[int, int, int, int, int, int]]] = {
 _POWERS = {"p": -12, "n": -9, "uµμ": -6, "m": -3, "c": -2, "d": -1, "h": 2, "k": 3, "M": 6, "G": 9}
 _SUPERSCRIPTS = str.maketrans({"²": "^2", "³": "^3", "⋅": "·", "⁻": "^-", "¹": "1"})  # "s⁻¹" as "s^-1"
 _PREFIXES = {letter: 10.0**power for letters, power in _POWERS.items() for letter in letters}
-_NO_PREFIX = "t in inch min h rpm °C degC Ncm Nmm 1 % deg ° degree degrees radian radians"
+_NO_PREFIX = "t in inch min h rpm °C degC °F degF Ncm Nmm 1 % deg ° degree degrees radian radians"
 _NO_PREFIX += " rev revs revolution revolutions turn turns"
 _PREFIXED = set(_UNITS) - set(_NO_PREFIX.split())
-_CELSIUS = {"°C", "degC"}  # an offset to K, so no factor converts them
+_ZEROS = {"°C": 273.15, "degC": 273.15, "°F": 255.372, "degF": 255.372}  # in K; no factor converts another zero
 _AMBIGUOUS = {"g", "C", "T", "F", "h", "t"}  # may also name an acceleration, a temperature, a torque, a time
 _ANGLES = {unit for unit, (_, exponents) in _UNITS.items() if exponents == (0, 0, 0, 0, 0, 1)}
 
@@ -75,8 +76,8 @@ def conversion(unit: str, wanted: str) -> float | None:
 
     >>> conversion("mm", "m"), conversion("N m", "Nm"), conversion("counts", "m"), conversion("rpm", "Hz")
     (0.001, 1.0, None, None)
-    >>> conversion("V", "m"), conversion("°C", "K")
-    (nan, nan)
+    >>> conversion("V", "m"), conversion("°C", "K"), conversion("degF", "°C")
+    (nan, nan, nan)
     """
     if unit.strip() == wanted.strip():
         return 1.0
@@ -84,7 +85,7 @@ def conversion(unit: str, wanted: str) -> float | None:
     if one is None or other is None:
         return None
     if one[1] == other[1]:
-        same_zero = (unit.strip() in _CELSIUS) == (wanted.strip() in _CELSIUS)
+        same_zero = _ZEROS.get(unit.strip()) == _ZEROS.get(wanted.strip())
         return float(f"{one[0] / other[0]:.12g}") if same_zero else np.nan
     ambiguous = one[1][:5] == other[1][:5] or _AMBIGUOUS & {unit.strip(), wanted.strip()}
     return None if ambiguous else np.nan

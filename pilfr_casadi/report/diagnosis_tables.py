@@ -411,7 +411,7 @@ def _collect_correction(diagnosis: Diagnosis) -> dict[str, Any]:
 def _write_law_expression(law: Any) -> tuple[tuple[Any, ...], str]:
     """Return the imports and the Python expression that make the class of a law."""
     if getattr(law, "factor", ""):
-        of_speed = ", of_speed=True" if "z_0" not in law.units else ""
+        of_speed = ", of_speed=True" if law.of_speed else ""
         return (learned_force,), f"learned_force({law.factor!r}{of_speed})"
     if issubclass(law, VaryingParameter) and law.signal:
         return (heated,), f"heated({law.signal!r})"

@@ -44,7 +44,7 @@ def test_a_unit_is_converted_to_another(unit, wanted, factor):
     assert conversion(unit, wanted) == (factor if factor is None else pytest.approx(factor, rel=1e-11))
 
 
-@pytest.mark.parametrize(("unit", "wanted"), [("V", "m"), ("°C", "K"), ("m", "m/s")])
+@pytest.mark.parametrize(("unit", "wanted"), [("V", "m"), ("°C", "K"), ("°F", "degC"), ("degF", "K"), ("m", "m/s")])
 def test_units_without_a_factor(unit, wanted):
     assert np.isnan(conversion(unit, wanted))
 

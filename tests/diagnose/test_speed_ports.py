@@ -144,7 +144,7 @@ def test_a_force_of_the_speed_that_no_law_follows_is_learned(braked: Diagnosis) 
     assert [learned.port for learned in braked.learned] == ["shaft"] and braked.verdict == "unexplained"
     errors = braked.errors["test"]
     assert errors["after"] < 0.15 * errors["before"]
-    assert "It holds where the speed is from" in braked.learned[0].sentence
+    assert "It holds where the local coordinate is from" in braked.learned[0].sentence
 
 
 def test_a_learned_force_of_the_speed_is_saturated_beyond_the_recordings(braked: Diagnosis) -> None:

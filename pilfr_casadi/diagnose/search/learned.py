@@ -55,6 +55,7 @@ class _Learned(Law):
     strength: ClassVar[tuple[str, ...]] = ("c",)
     factor: ClassVar[str] = ""  # input that scales a part of the force
     features: ClassVar[int]  # their number
+    of_speed: ClassVar[bool] = False  # whether it stands at a port that has no position
     listed = False
 
     def weigh(self, phi: Sequence[Any], p: Any, u: Any) -> Any:
@@ -134,6 +135,7 @@ class LearnedForceOfSpeed(_Learned):
     strength: ClassVar[tuple[str, ...]] = ("c",)
     defaults: ClassVar[Mapping[str, Any]] = {"u_0": 0.0, "v_low": -1.0, "u_low": -1.0}
     features = 1 + SPEED_CURVES
+    of_speed = True
 
     def force(self, dz: Any, p: Any) -> Any:
         """Compute the force."""
@@ -355,7 +357,11 @@ class Learned:
         names = ", ".join(f"{display_name(n.law)} (off by {100 * n.error:.2g} %)" for n in self.nearest)
         near = f" The nearest laws are {names}." if names else ""
         z, dz = (f"{np.min(v):.4g} to {np.max(v):.4g}" for v in (self.z, self.dz))
-        where = f"the speed is from {dz}" if np.array_equal(self.z, self.dz) else f"z is from {z} and dz/dt from {dz}"
+        where = (
+            f"the local coordinate is from {dz}"
+            if np.array_equal(self.z, self.dz)
+            else f"z is from {z} and dz/dt from {dz}"
+        )
         return (
             f"A learned force acts at {self.port}{by}. It holds where {where}, as in the training recordings, and is "
             f"saturated beyond.{near}"
