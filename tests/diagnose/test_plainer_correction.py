@@ -96,4 +96,6 @@ def test_a_law_is_compared_in_its_likeliest_form() -> None:
     trials["other"].evidence = 17
     assert list(indistinguishable(search, trials["curved"], own)) == [("wall", "damping")]  # type: ignore[arg-type]
     trials["nothing"] = SimpleNamespace(names=frozenset(), evidence=10, mean_square=0.0105)
+    assert indistinguishable(search, trials["curved"], own)  # type: ignore[arg-type]
+    trials["other"].mean_square = 0.0105  # it explains nothing
     assert not indistinguishable(search, trials["curved"], own)  # type: ignore[arg-type]

@@ -85,7 +85,7 @@ def test_what_a_spring_stores_is_no_damping(law, d, damping):
 
 def test_what_speaks_against_a_law_without_a_sure_name_is_a_sentence():
     law = NamelessLaw("dry friction at ground", "w = F_c sign(v)", "as fitted it helps the motion", {}, "")
-    blocks = nameless_blocks(SimpleNamespace(nameless_laws=[law]))
+    blocks = nameless_blocks(SimpleNamespace(nameless_laws=[law], effects=()))
     assert [b.text for b in blocks if isinstance(b, Text)] == [
         "Dry friction at ground:",
         "As fitted it helps the motion.",
