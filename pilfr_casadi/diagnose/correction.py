@@ -298,7 +298,7 @@ def _polish(search: Search, trials: Sequence[Trial]) -> list[_Candidate]:
 def _learned_candidates(search: Search, base: Trial, taken: Collection[str] = ()) -> list[_Candidate]:
     """Make the candidate with the best learned force beside a trial at a port that is not taken, if there is one.
 
-    If an input scales a part of it, so that it has twice as many weights, the best one without that competes as well.
+    If an input scales a part of it, so that it has twice as many weights, the best found without that competes as well.
     After the deadline no further force is fitted.
     """
     if search.past_deadline:

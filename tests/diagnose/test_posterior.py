@@ -287,6 +287,16 @@ def test_a_law_that_degenerates_at_its_values_names_nothing_however_well_it_foll
     assert posterior(search(trial(CUBIC))).named < 0.5
 
 
+def test_a_hypothesis_is_no_surer_than_its_surest_law(search, trial):
+    """Together two laws leave little, but each of them little less than the other one alone."""
+    both, small = trial(DRY, ("b", CubicStiffness), left=1e-4), ("b", CubicStiffness)
+    found = search(both, trial(DRY, left=2e-4), trial(small, left=2e-4))
+    found.findings[both.key].flexible = {"a": 0.9}
+    answer = posterior(found)
+    assert share_named(explainable_remainder(found, both)) > 0.9
+    assert answer.best is both and answer.named < 0.5
+
+
 def test_effects_are_said_in_the_form_that_corrects(search, trial):
     plain, other = trial(DRY, left=1e-4), trial(("a", DirectionalFriction), left=1e-4)
     found = posterior(search(plain, other))
