@@ -98,7 +98,7 @@ def _search_forgetting_sooner(
     """Search with a shorter memory if the likeliest hypothesis predicts better with one; return what was found if not.
 
     So too if that search was cut short before it found as much. Effects that only the longer memory shows well enough
-    to be sure stay if they are the likeliest with the shorter one as well: then they do not only imitate it.
+    to be sure stay if the likeliest hypothesis with the shorter one has them, too: then they do not only imitate it.
     """
     observed_request, first, memory = found
     sooner = forget_sooner(first.search, request.simulator, memory)
@@ -116,7 +116,7 @@ def _search_forgetting_sooner(
     if other.search.cut_short and before2 <= after2:
         return found
     longer, sure = posterior(first.search), posterior(other.search).sure > SURE
-    if longer.sure > SURE and not sure and other.search.best.names == longer.best.names:
+    if longer.sure > SURE and not sure and longer.best.names <= other.search.best.names:
         note = agreement_note(request.simulator, shorter, memory)
         return replace(observed_request, notes=(*observed_request.notes, note)), first, memory
     return sooner_request, other, shorter
