@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from .. import identify, laws, simulators
-from .._base import capitalise, percent, to_json, with_nan
+from .._base import capitalise, in_words, percent, to_json, with_nan
 from ..data import DIVERGING
 from ..diagnose import ERROR_NAMES, Diagnosis, Effect, Fitted, Workbench, law_signals, learned_force
 from ..laws import (
@@ -56,11 +56,11 @@ def correction_label(diagnosis: Diagnosis) -> str:
     """Name the corrected simulator in a legend; empty if it is the refitted one."""
     if diagnosis.effects:
         names = [_short_name(e) for e in diagnosis.effects]
-        if any(g.finding == "unsure" for g in diagnosis.gates):
+        if diagnosis.nameless_laws:
             names.append("laws of uncertain name")
         if diagnosis.learned:
             names.append("a learned force")
-        return f"with {' and '.join(names)}"
+        return f"with {in_words(names)}"
     if diagnosis.nameless:
         return "corrected"
     if diagnosis.freed:

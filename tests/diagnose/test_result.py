@@ -79,6 +79,7 @@ def test_further_laws_of_the_corrected_simulator_are_told_beside_the_named_ones(
     assert "F_c = 0.25" in told and "without a sure name" not in str(found)
     page = diagnosis_report(more, tmp_path).read_text()
     assert "Also in the correction, without a sure name: Coulomb friction (smooth) at ground:" in page
+    assert "with cubic stiffness and laws of uncertain name" in page
 
 
 def test_a_port_with_the_wrong_sign_is_told():
