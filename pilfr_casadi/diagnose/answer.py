@@ -19,7 +19,7 @@ from .arguments import Request
 from .blind_spots import BlindSpot, assess_recordings
 from .correction import Correction
 from .detectability import port_units
-from .effect import Effect
+from .effect import Effect, sign_doubt
 from .experiment import next_experiment
 from .faults.channels import IN_RECORDINGS, find_gross_channel_errors
 from .faults.gates import EQUAL_RATIO, TEST_FAULT, TEST_OFFSET, Gate, edited
@@ -341,11 +341,8 @@ def _make_effect(
     law = element.law
     own, unrelated = placebo(bench, search.root.fitted, element.port, law)
     port = bench.simulator.port(element.port)
-    remarks = [law.remark(element.own(fitted.values)), *_describe_order(fitted, element)]
-    if _acts_along(fitted, element):
-        remarks.append(
-            "its strength is negative, as a positive force at this port helps the motion: check the port's sign"
-        )
+    doubt = sign_doubt(fitted.simulator, element, fitted.values)
+    remarks = [law.remark(element.own(fitted.values)), doubt, *_describe_order(fitted, element)]
     if law.turns and is_curve_along(bench, final.drawn[1], fitted.simulator.elements.index(element)):
         remarks.append("these recordings do not show its memory: a curve follows them as well")
     if other_forms:
@@ -388,17 +385,6 @@ def _effect_parameters(
                 "at_limit": bool(v and limited[i]),
             }
     return out
-
-
-def _acts_along(fitted: Fitted, element: Placed) -> bool:
-    """Tell whether a friction or damping has negative strengths alone, because of the sign of its declared port."""
-    law, simulator = element.law, fitted.simulator
-    if not law.dissipative or element.port not in {port.name for port in simulator.ports}:
-        return False
-    moved = simulator.into(simulator.port(element.port), *simulator.symbols())
-    values = element.own(fitted.values)
-    strengths = np.concatenate([np.ravel(values[name]) for name in law.strength if name not in law.signed])
-    return not set(moved) <= set(simulator.output_names) and bool(np.all(strengths <= 0) and np.any(strengths < 0))
 
 
 def _other_forms(search: Search, effects: Sequence[LikelyEffect], effect: LikelyEffect) -> list[Law]:

@@ -10,9 +10,25 @@ from typing import Any
 
 import numpy as np
 
-from ..simulators import EQUATION, PARAMETER, in_series, name_at, split_port
+from ..simulators import EQUATION, PARAMETER, Placed, Simulator, in_series, name_at, split_port
 from .faults.gates import value_with_unit
 from .fits.evidence import SURE
+
+OUTPUT_REVERSED = "as fitted it helps the motion: the sign of the output, or of the port's rate, may be reversed"
+PORT_REVERSED = "its strength is negative, as a positive force at this port helps the motion: check the port's sign"
+
+
+def sign_doubt(simulator: Simulator, e: Placed, values: Mapping[str, Any]) -> str:
+    """Say that friction or damping in a declared port has negative strengths alone; empty if it opposes the motion."""
+    law = e.law
+    if not law.dissipative or e.port not in {port.name for port in simulator.ports}:
+        return ""
+    own = e.own(values)
+    strengths = np.concatenate([np.zeros(0), *(np.ravel(own[name]) for name in law.strength if name not in law.signed)])
+    if not (np.all(strengths <= 0) and np.any(strengths < 0)):
+        return ""
+    moved = simulator.into(simulator.port(e.port), *simulator.symbols())
+    return OUTPUT_REVERSED if set(moved) <= set(simulator.output_names) else PORT_REVERSED
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,7 @@ from ..models import Parameter, ParameterSet, is_at_bound
 from ..simulators import Placed, Simulator, name_at, split_port
 from .blind_spots import BlindSpot
 from .correction import Correction
-from .effect import Effect
+from .effect import Effect, sign_doubt
 from .faults.gates import TEST_FAULT, TEST_OFFSET, Gate, value_with_unit
 from .faults.offsets import describe_offsets, find_placed_offsets, recorded_at
 from .fits.evidence import BETTER_RATIO, FAR_RATIO, NEAR_RATIO, all_sure
@@ -26,7 +26,6 @@ ERROR_NAMES = {"nominal": "as given", "before": "refitted", "after": "corrected"
 MOST_PRINTED = 8  # parameters and blind spots that are printed at most
 GRAVEST_SPOTS = 2  # blind spots that are printed right after the verdict
 NEAR_CONSTANT = 0.9  # error above which a refitted simulator is hardly better than a constant
-HELPS_MOTION = "as fitted it helps the motion: the sign of the output, or of the port's rate, may be reversed"
 INTERRUPTED = "The search was interrupted: the answer rests on the fits made until then."
 OUT_OF_TIME = (
     "The time limit ended the search: the answer rests on the fits made until then. A longer one (time_limit, "
@@ -374,7 +373,8 @@ class ResultText:
             if e.law.listed and e.name not in named:
                 own = {name: parameters[f"{e.prefix}{name}"] for name in e.law.parameters()}
                 free = {name: p for name, p in own.items() if not np.all(p.fixed)}
-                doubt, alike = self._acts_with_motion(e) * HELPS_MOTION, listed(self._alike(e), MOST_PRINTED)
+                doubt = sign_doubt(self.corrected, e, {name: p.value for name, p in self.corrected.parameters.items()})
+                alike = listed(self._alike(e), MOST_PRINTED)
                 out.append(NamelessLaw(e.words, e.law.equation, doubt, free, alike))
         return out
 
@@ -385,18 +385,6 @@ class ResultText:
             return []
         own = [element for element in closest.laws if element.name == e.name]
         return [name_at(port, law) for element in own for port, law in indistinguishable(search, closest, element)]
-
-    def _acts_with_motion(self, e: Placed) -> bool:
-        """Tell whether friction or damping in an output, where it may have either sign, helps the motion."""
-        law, simulator = e.law, self.corrected
-        if not law.dissipative:
-            return False
-        moved = simulator.into(simulator.port(e.port), *simulator.symbols())
-        if not set(moved) <= set(simulator.output_names):
-            return False
-        names = {*law.strength} - {*law.signed}
-        opposing = [p.value for name, p in e.own(simulator.parameters).items() if name in names]
-        return all(np.all(v <= 0) for v in opposing) and any(np.any(v < 0) for v in opposing)
 
     def _value_lines(self) -> list[str]:
         """List the simulator's own estimated values, largest changes first."""

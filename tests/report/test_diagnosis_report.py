@@ -106,11 +106,11 @@ def test_reasons_for_less_confidence_are_mentioned(tmp_path):
 
 
 @pytest.mark.usefixtures("blank_figures")
-@pytest.mark.slow
-def test_a_correction_without_a_name_is_mentioned_with_the_error(tmp_path):
-    d, note = example(), Gate("ground", "unsure", "creep", "Beside it something more is missing.", False)
+def test_a_law_without_a_name_is_mentioned_with_the_error(tmp_path):
+    d = example()
     assert "laws of uncertain name" not in Reader(diagnosis_report(d, tmp_path).read_text()).text
-    text = Reader(diagnosis_report(replace(d, gates=(note,)), tmp_path).read_text()).text
+    more = d.corrected.with_element("ground", CoulombFriction().at({"F_c": 0.25, "v_0": 2e-3}))
+    text = Reader(diagnosis_report(replace(d, corrected=more), tmp_path).read_text()).text
     assert "with cubic stiffness and laws of uncertain name put back" in text
 
 
