@@ -32,7 +32,7 @@ from ...laws import (
 )
 from ...simulators import PARAMETER, Placed, in_series, kind_of
 from ..faults.gates import EQUAL_RATIO
-from ..fits.evidence import BETTER_RATIO, FAR_RATIO, NEAR_RATIO
+from ..fits.evidence import FAR_RATIO, NEAR_RATIO
 from ..fits.force_recovery import forces_of_change, signals_along
 from ..fits.linearise import port_signals
 from ..fits.screen import HUGE, Pair, Scored, fit_shapes, orthonormal, project_off, screen, start_values, usable
@@ -119,14 +119,11 @@ class Forms(Hypotheses):
         converged += filter(None, self.on_workers(self._reorder, converged))
         for trial in converged:
             self.keep(trial)
-        # finer steps are slow; they bring none to the front that is far behind, and none if they do not help the first
+        # finer steps are slow, and bring no hypothesis that is far behind to the front
         least = min([t.error for t in (*converged, self.best)])
-        near = [t for t in converged if t.knee and t.error < NEAR_RATIO * least]
-        for trial in sorted(near, key=self.optimistic_evidence, reverse=True):
-            finer = self.fits.refine_knee(trial)
-            self.keep(finer)
-            if BETTER_RATIO * finer.error > trial.error:
-                break
+        near = [t for t in converged if t.error < NEAR_RATIO * least]
+        for trial in self.on_workers(self.fits.refine_knee, near):
+            self.keep(trial)
 
     def _reorder(self, trial: Trial) -> Trial | None:
         """Fit a hypothesis with its added law before the others of the same signal.
